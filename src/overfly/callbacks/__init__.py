@@ -1,0 +1,8 @@
+"""What is written while training: metrics, curves, pictures and predictions."""
+
+from overfly.callbacks.curves import Curves
+from overfly.callbacks.loggers import MetricsCsv, finish_loggers
+from overfly.callbacks.pictures import Pictures, Predictions
+from overfly.callbacks.progress import EpochLines, Progress
+
+__all__ = ["Curves", "EpochLines", "MetricsCsv", "Pictures", "Predictions", "Progress", "finish_loggers"]

@@ -1,0 +1,228 @@
+"""The point cloud: points with colour, confidence and origin, and its files (PLY, LAS, LAZ).
+
+PLY carries the CRS as a comment ``epsg 32615``, LAS and LAZ in their header. Coordinates are stored as float64 (PLY) or
+on a 1 mm grid (LAS, LAZ), so that UTM coordinates keep their millimetres. Confidence, sigma_m, views and predicted
+are properties of these names in PLY and extra dimensions in LAS.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.errors import InputError
+from overfly.files import existing, replacing
+from overfly.ply import read_ply, write_ply
+
+SUFFIXES = (".ply", ".las", ".laz")
+EXTRAS: dict[str, str] = {"confidence": "f4", "sigma_m": "f4", "views": "u1", "predicted": "u1"}
+"""The optional attributes that files keep, and their types there."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points in one frame of reference; every array has the same first dimension N.
+
+    Attributes:
+        points: [N, 3] float64, metres (local ENU, or easting, northing, height where ``epsg`` is set).
+        colors: [N, 3] uint8 RGB, or None.
+        confidence: [N] float32 in 0..1, or None.
+        sigma_m: [N] float32, standard deviation of the position in metres, or None.
+        views: [N] uint8, number of frames that measured the point, or None.
+        predicted: [N] bool, True where fewer than two frames support the point, or None.
+        epsg: CRS of the points, None for a local frame.
+    """
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8] | None = None
+    confidence: NDArray[np.float32] | None = None
+    sigma_m: NDArray[np.float32] | None = None
+    views: NDArray[np.uint8] | None = None
+    predicted: NDArray[np.bool_] | None = None
+    epsg: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: NDArray | slice) -> Cloud:
+        """The points that ``index`` (a mask, integers or a slice) selects, with all their attributes."""
+        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "epsg"}
+        arrays = {name: None if array is None else array[index] for name, array in arrays.items()}
+        return Cloud(**(arrays | {"epsg": self.epsg}))
+
+    def with_points(self, points: NDArray, epsg: int | None = None) -> Cloud:
+        """The same attributes at other coordinates."""
+        return replace(self, points=np.asarray(points, np.float64), epsg=epsg)
+
+
+def voxel_thin(points: NDArray, size_m: float) -> NDArray[np.int64]:
+    """Indices of one point (the first) per cubic voxel of ``size_m``; sorted."""
+    keys = np.floor((points - points.min(0)) / size_m).astype(np.int64)
+    spans = [int(span) + 1 for span in keys.max(0)]
+    if spans[0] * spans[1] * spans[2] >= 2**63:  # an outlier far away: the flat key would overflow
+        return np.sort(np.unique(keys, axis=0, return_index=True)[1])
+    flat = (keys[:, 0] * spans[1] + keys[:, 1]) * spans[2] + keys[:, 2]
+    return np.sort(np.unique(flat, return_index=True)[1])
+
+
+def concatenate(clouds: list[Cloud]) -> Cloud:
+    """All points of several clouds that share a frame of reference; attributes missing from any one are dropped."""
+    if len({c.epsg for c in clouds}) > 1:
+        raise InputError(f"Clouds in different CRS cannot be joined: EPSG {sorted({str(c.epsg) for c in clouds})}.")
+    joined: dict[str, Any] = {}
+    for f in fields(Cloud):
+        values = [getattr(c, f.name) for c in clouds]
+        if f.name != "epsg":
+            joined[f.name] = None if any(v is None for v in values) else np.concatenate(values)
+    return Cloud(**joined, epsg=clouds[0].epsg)
+
+
+def read_cloud(path: Path | str) -> Cloud:
+    """Read a .ply (its vertices, if it is a mesh), .las or .laz file.
+
+    Raises:
+        InputError: the file is missing, of another kind, broken, empty, holds NaN or is not in metres.
+    """
+    path = existing(path, "The cloud", SUFFIXES)
+    cloud = _read_ply(path) if path.suffix.lower() == ".ply" else _read_las(path)
+    if not len(cloud):
+        raise InputError(f"The cloud {path} has no points: give a file with at least one.")
+    if bad := int((~np.isfinite(cloud.points)).any(axis=1).sum()):
+        raise InputError(f"{bad} of the {len(cloud)} points of {path} are NaN or infinite: remove them first.")
+    return cloud
+
+
+def write_cloud(cloud: Cloud, path: Path | str) -> None:
+    """Write .ply, .las or .laz (by the suffix), atomically; every attribute and the CRS are kept.
+
+    Raises:
+        InputError: the suffix is unknown, the cloud is empty or holds NaN.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"A cloud cannot be written as {path.name}: end the name in {', '.join(SUFFIXES)}.")
+    if not len(cloud) or not np.isfinite(cloud.points).all():
+        what = "has NaN or infinite coordinates" if len(cloud) else "has no points"
+        raise InputError(f"The cloud for {path} {what}, so it was not written.")
+    if path.suffix.lower() == ".ply":
+        _write_ply(cloud, path)
+    else:
+        _write_las(cloud, path)
+
+
+def _read_ply(path: Path) -> Cloud:
+    ply = read_ply(path)
+    columns = ply.columns
+    if not {"x", "y", "z"} <= columns.keys():
+        raise InputError(f"{path} has no x, y and z: give a point cloud or a mesh.")
+    colors = None
+    for names in (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")):
+        if set(names) <= columns.keys():
+            colors = np.stack([_as_uint8(columns[name]) for name in names], axis=1)
+            break
+    epsg = [int(c.split()[1]) for c in ply.comments if c.startswith("epsg ") and c.split()[1].isdigit()]
+    return Cloud(
+        np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1),
+        colors,
+        **_attributes({name: columns[name] for name in EXTRAS if name in columns}),
+        epsg=epsg[0] if epsg else None,
+    )
+
+
+def _write_ply(cloud: Cloud, path: Path) -> None:
+    columns = dict(zip("xyz", np.asarray(cloud.points, np.float64).T, strict=True))
+    if cloud.colors is not None:
+        columns |= dict(zip(("red", "green", "blue"), np.asarray(cloud.colors, np.uint8).T, strict=True))
+    for name, kind in EXTRAS.items():
+        if (values := getattr(cloud, name)) is not None:
+            columns[name] = np.asarray(values).astype(kind)
+    write_ply(path, columns, comments=(f"epsg {cloud.epsg}",) if cloud.epsg else ())
+
+
+def _read_las(path: Path) -> Cloud:
+    import laspy
+    import lazrs
+
+    try:
+        las = laspy.read(path)
+    except (laspy.LaspyException, lazrs.LazrsError, ValueError, OSError, EOFError, OverflowError) as error:
+        raise InputError(
+            f"{path} is not a readable LAS file ({error}): write it again or give another file."
+        ) from error
+    if len(las.points) != las.header.point_count:
+        raise InputError(
+            f"{path} is cut off: {len(las.points)} of its {las.header.point_count} points are there; copy it again."
+        )
+    names = set(las.point_format.dimension_names)
+    colors = None
+    if {"red", "green", "blue"} <= names:
+        deep = np.stack([las.red, las.green, las.blue], axis=1)
+        # The standard asks for 16 bits, yet many programs write 8-bit values.
+        colors = (deep >> 8 if deep.size and deep.max() > 255 else deep).astype(np.uint8)
+        colors = colors if deep.any() else None
+    return Cloud(
+        np.stack([np.asarray(las.x), np.asarray(las.y), np.asarray(las.z)], axis=1).astype(np.float64),
+        colors,
+        **_attributes({name: np.asarray(las[name]) for name in EXTRAS if name in names}),
+        epsg=_epsg(las.header, path),
+    )
+
+
+def _epsg(header: Any, path: Path) -> int | None:
+    """The EPSG code in a LAS header; None without a CRS or code: then the frame counts as local."""
+    from pyproj.exceptions import CRSError
+
+    try:
+        crs = header.parse_crs()
+    except CRSError as error:
+        raise InputError(f"The CRS in the header of {path} is not readable ({error}): write it again.") from error
+    if crs is None:
+        return None
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    if units := {a.unit_name for a in crs.axis_info} - {"metre", "meter"}:
+        raise InputError(
+            f"{path} is in {horizontal.name}, whose unit is {', '.join(sorted(units))}; Overfly works in metres: "
+            "reproject it first, for example with `pdal translate in.laz out.laz reprojection "
+            "--filters.reprojection.out_srs=EPSG:32610` and the UTM zone of the place."
+        )
+    return horizontal.to_epsg()
+
+
+def _write_las(cloud: Cloud, path: Path) -> None:
+    import laspy
+    from pyproj import CRS
+
+    header = laspy.LasHeader(point_format=6 if cloud.colors is None else 7, version="1.4")
+    header.scales = np.full(3, 0.001)
+    header.offsets = np.floor(cloud.points.min(0))
+    header.generating_software = "Overfly"
+    if cloud.epsg:
+        header.add_crs(CRS.from_epsg(cloud.epsg))
+    kept = [name for name in EXTRAS if getattr(cloud, name) is not None]
+    header.add_extra_dims([laspy.ExtraBytesParams(name, EXTRAS[name]) for name in kept])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = np.asarray(cloud.points, np.float64).T
+    if cloud.colors is not None:
+        las.red, las.green, las.blue = np.asarray(cloud.colors, np.uint16).T * 257
+    for name in kept:
+        las[name] = np.asarray(getattr(cloud, name)).astype(EXTRAS[name])
+    with replacing(path) as temporary:
+        las.write(temporary)
+
+
+def _as_uint8(values: NDArray) -> NDArray[np.uint8]:
+    """Colours as uint8; fractions of one, in floating-point files, are scaled."""
+    if np.issubdtype(values.dtype, np.floating) and (not values.size or values.max() <= 1):
+        values = np.rint(values * 255)
+    if values.dtype.itemsize == 2 and values.size and values.max() > 255:
+        values = values >> 8
+    return np.clip(values, 0, 255).astype(np.uint8)
+
+
+def _attributes(columns: dict[str, NDArray]) -> dict[str, NDArray]:
+    """File columns in the types of :class:`Cloud`."""
+    return {k: v.astype(bool) if k == "predicted" else v.astype(EXTRAS[k]) for k, v in columns.items()}

@@ -1,0 +1,49 @@
+"""Files that are either complete or absent."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import mkdtemp
+
+from overfly.errors import InputError
+
+
+@contextmanager
+def replacing(path: Path | str) -> Iterator[Path]:
+    """A temporary path beside ``path`` that takes its place when the block ends well, and vanishes when it fails.
+
+    Readers, and a process that is killed in the middle, see the old file or the whole new one. Missing
+    folders are made.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # A folder of its own keeps the name and suffix, which writers of meshes and rasters look at.
+    folder = Path(mkdtemp(prefix=f".{path.name}.", dir=path.parent))
+    try:
+        temporary = folder / path.name
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        for rest in folder.iterdir():
+            rest.unlink()
+        folder.rmdir()
+
+
+def existing(path: Path | str, what: str, suffixes: tuple[str, ...]) -> Path:
+    """``path``, if it is a file with one of the ``suffixes``.
+
+    Raises:
+        InputError: it is missing, a folder, or of another kind.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        given = f"{what} {path} ends in {path.suffix!r}" if path.suffix else f"{what} {path} has no file ending"
+        raise InputError(f"{given}: give a file that ends in {', '.join(suffixes)}.")
+    if not path.exists():
+        raise InputError(f"{what} {path} does not exist: check the path.")
+    if not path.is_file():
+        raise InputError(f"{what} {path} is not a file: give a file that ends in {', '.join(suffixes)}.")
+    return path

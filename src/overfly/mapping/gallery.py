@@ -1,0 +1,111 @@
+"""The pictures of a map's report, and the surface that its numbers are counted on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.cloud import Cloud
+from overfly.data.footprints import footprint, sees
+from overfly.geometry import Array, Camera, transform
+from overfly.mapping import pictures
+from overfly.mapping.raster import Surface
+from overfly.mapping.report import Picture
+
+FLAT = 100_000
+"""Points kept for the oblique picture: more would not be seen in it."""
+
+
+def upright(cloud: Cloud, poses: Array) -> tuple[Cloud, Array]:
+    """A cloud of unknown orientation turned so that up is up in pictures: against the mean viewing direction.
+
+    Only for pictures; the product stays in the cameras' frame.
+    """
+    forward = np.mean(poses[:, :3, 2], axis=0)
+    up = -np.mean(poses[:, :3, 1], axis=0)
+    # Cameras that look down say up by their optical axis, those that look ahead by their vertical one.
+    z = -forward if np.linalg.norm(forward) > 0.6 else up
+    z = z / np.linalg.norm(z)
+    x = np.cross(np.array([0.0, 1, 0]) if abs(z[1]) < 0.9 else np.array([1.0, 0, 0]), z)
+    x /= np.linalg.norm(x)
+    turn = np.eye(4)
+    turn[:3, :3] = np.stack([x, np.cross(z, x), z])
+    return cloud.with_points(transform(turn, cloud.points)), turn @ poses
+
+
+def gallery(
+    cloud: Cloud,
+    cameras: Sequence[Camera],
+    poses: Array,
+    names: Sequence[str],
+    *,
+    gsd: float,
+    unit: str,
+    missing: Sequence[tuple[str, NDArray]] = (),
+) -> tuple[list[Picture], Surface]:
+    """All pictures of a report.
+
+    Args:
+        cloud: the map, in the same z-up frame as the poses (metres or units).
+        cameras, poses, names: registered frames, poses [n, 4, 4], in the order of the flight.
+        gsd: ground sampling distance.
+        unit: of lengths, for the scale bars.
+        missing: name and position [>=2] of frames that were not registered.
+    """
+    seen = pictures.overview(cloud, min_cell=2 * gsd)
+    ground = float(np.nanmedian(seen.heights))
+    outlines = [footprint(camera, pose, ground) for camera, pose in zip(cameras, poses, strict=True)]
+    views = views_per_cell(seen, cameras, poses)
+    near = cloud if len(cloud) <= 20 * FLAT else cloud[:: len(cloud) // (20 * FLAT) + 1]
+    shown = [
+        Picture(
+            "The map",
+            "From above",
+            "Colours of the cloud seen straight from above; north is up. White: nothing measured.",
+            pictures.jpeg(pictures.top_view(seen)),
+        ),
+        Picture(
+            "The map",
+            "Heights",
+            "Surface heights over a hillshade (light from the north-west).",
+            pictures.png(pictures.height_map(seen, unit=unit)),
+        ),
+        Picture(
+            "In perspective",
+            "The cloud from the south",
+            "Every point with its own colour, as stored in cloud.laz.",
+            pictures.jpeg(pictures.oblique_view(near)),
+        ),
+        Picture(
+            "The flight",
+            "Images",
+            "Where the registered images were taken (dots, joined in the order of the flight) and what they cover.",
+            pictures.png(pictures.block_map(seen, poses[:, :3, 3], outlines, missing=missing, names=names, unit=unit)),
+        ),
+        Picture(
+            "The flight",
+            "Overlap",
+            "How many images have a place inside their frame. Two are needed to measure; three or more make it reliable.",
+            pictures.png(pictures.views_map(seen.grid, views, unit=unit)),
+        ),
+    ]
+    if cloud.predicted is not None and cloud.predicted.any():
+        picture = pictures.origin_map(seen, unit=unit)
+        assert picture is not None
+        caption = "Where the surface was measured, and where it is only predicted: do not measure there."
+        shown.append(Picture("Measured and predicted", "Measured and predicted ground", caption, pictures.png(picture)))
+    return shown, replace(seen, views=views)
+
+
+def views_per_cell(seen: Surface, cameras: Sequence[Camera], poses: Array) -> NDArray[np.float64]:
+    """Number of frames that have each cell of the surface inside them [rows, columns]; NaN where it is empty."""
+    count = np.full(seen.heights.shape, np.nan)
+    points = np.concatenate([seen.grid.centres(), seen.heights[..., None]], axis=-1)[seen.filled]
+    total = np.zeros(len(points))
+    for camera, pose in zip(cameras, poses, strict=True):
+        total += sees(points, camera, pose)
+    count[seen.filled] = total
+    return count

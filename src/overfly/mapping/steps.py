@@ -1,0 +1,185 @@
+"""The steps of a map: named, timed, and kept in ``OUT/work`` so that a map that was stopped goes on where it was.
+
+A step's result is a folder named by a key of everything that it depends on. It is written under another name and
+renamed when complete, so a kill at any time loses only the running step.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from overfly.errors import InputError
+
+T = TypeVar("T")
+
+
+def key_of(*parts: Any) -> str:
+    """Sixteen hexadecimal digits that depend on every part (anything JSON can write, and paths)."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def fingerprint(paths: Sequence[Path]) -> list[tuple[str, int, int]]:
+    """Name, size and modification time of files: equal while nobody touches them."""
+    return [(p.name, p.stat().st_size, p.stat().st_mtime_ns) for p in sorted(paths) if p.is_file()]
+
+
+def peak_memory_mb() -> float:
+    """The most memory that this process or one of its children has held."""
+    largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return largest / (1024 if sys.platform != "darwin" else 1024**2)
+
+
+class Steps:
+    """Runs steps one after the other, tells them on stderr, and keeps their results.
+
+    Args:
+        folder: where results are kept.
+        resume: reuse results whose key is the same; False makes them all anew.
+        show: print a line for each step and progress bars; False is silent.
+    """
+
+    def __init__(self, folder: Path, *, resume: bool, show: bool) -> None:
+        self.folder, self.resume = folder, resume
+        self.console = Console(stderr=True, quiet=not show, highlight=False, soft_wrap=True)
+        self.seconds: dict[str, float] = {}
+        self.reused: list[str] = []
+        self.running: str | None = None
+
+    def say(self, step: str, text: str) -> None:
+        """One line on stderr."""
+        self.console.print(f"[bold]{step:>9}[/bold]  {text}")
+
+    @contextmanager
+    def timed(self, step: str) -> Iterator[None]:
+        """Adds the seconds of the block to the step."""
+        self.running, start = step, time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[step] = round(self.seconds.get(step, 0.0) + time.perf_counter() - start, 2)
+        self.running = None
+
+    def kept(
+        self,
+        step: str,
+        key: str,
+        make: Callable[[Path], T],
+        write: Callable[[T, Path], None],
+        read: Callable[[Path], T],
+    ) -> T:
+        """The result of a step: read where it is kept under ``key``, made and kept otherwise.
+
+        Args:
+            step: its name, also in ``seconds``.
+            key: of all that the result depends on (:func:`key_of`).
+            make: makes the result; gets a scratch folder of its own that survives a kill, for finished parts.
+            write: writes it into a folder.
+            read: reads it from a folder.
+        """
+        place, scratch = self.folder / f"{step}-{key}", self.folder / f"{step}-{key}.scratch"
+        if self.resume and place.is_dir():
+            with self.timed(step):
+                result = read(place)
+            self.reused.append(step)
+            self.say(step, "[dim]kept from the last run (same images, same settings)[/dim]")
+            return result
+        if not self.resume:
+            shutil.rmtree(scratch, ignore_errors=True)
+        with self.timed(step):
+            scratch.mkdir(parents=True, exist_ok=True)
+            result = make(scratch)
+            part = self.folder / f"{step}-{key}.{os.getpid()}.part"
+            shutil.rmtree(part, ignore_errors=True)
+            part.mkdir()
+            write(result, part)
+            shutil.rmtree(place, ignore_errors=True)
+            os.replace(part, place)
+            shutil.rmtree(scratch, ignore_errors=True)
+        self._forget_others(step, key)
+        return result
+
+    def _forget_others(self, step: str, key: str) -> None:
+        """Results of the same step with other settings would only fill the disk."""
+        for other in self.folder.glob(f"{step}-*"):
+            if not other.name.startswith(f"{step}-{key}"):
+                shutil.rmtree(other, ignore_errors=True)
+
+    @contextmanager
+    def bar(self, step: str, what: str) -> Iterator[Callable[[int, int], None]]:
+        """A progress bar; the block calls it with (done, in all)."""
+        columns = (
+            TextColumn(f"[bold]{step:>9}[/bold]  {what}"),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=self.console, transient=True, disable=self.console.quiet) as progress:
+            task = progress.add_task(what, total=None)
+
+            def update(done: int, total: int) -> None:
+                progress.update(task, completed=done, total=total)
+
+            yield update
+
+
+OWN = ("cloud.laz", "cloud.ply", "dsm.tif", "orthophoto.tif", "map.json", "report.html", "transforms.json")
+
+
+def claim(out: Path, flight: Path, identity: str, *, overwrite: bool) -> Path:
+    """Make ``out`` the folder of this flight's map; returns its work folder.
+
+    Args:
+        out: the folder of the results.
+        flight: the flight folder.
+        identity: key of the flight's images, equal when the flight was only moved.
+        overwrite: take the folder over from another flight's map, whose kept steps are removed.
+
+    Raises:
+        InputError: it holds the map of another flight, files of ours of unknown origin, or is the flight itself.
+    """
+    out, flight = out.resolve(), flight.resolve()
+    if out == flight or out == flight / "images":
+        raise InputError(f"--out {out} is the flight itself, which is never written to: give another folder.")
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out {out} is a file: give a folder.")
+    work = out / "work"
+    mark = work / "flight.json"
+    if not overwrite:
+        if mark.is_file():
+            with contextlib.suppress(json.JSONDecodeError):
+                owner: Mapping[str, str] = json.loads(mark.read_text())
+                if owner.get("flight") != str(flight) and owner.get("identity") != identity:
+                    raise InputError(
+                        f"{out} holds the map of another flight, {owner.get('flight')}: "
+                        "give another --out folder, or --overwrite to replace it."
+                    )
+        elif taken := [name for name in OWN if (out / name).exists()]:
+            raise InputError(
+                f"{out} already holds {', '.join(taken)} of unknown origin: "
+                "give another --out folder, or --overwrite to replace it."
+            )
+    else:
+        shutil.rmtree(work, ignore_errors=True)
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+        for stale in [*work.glob("*.part"), *(p for name in OWN for p in out.glob(f".{name}.*"))]:
+            shutil.rmtree(stale, ignore_errors=True)  # left behind by a killed process
+        mark.write_text(json.dumps({"flight": str(flight), "identity": identity}) + "\n")
+    except OSError as error:
+        raise InputError(f"--out {out} cannot be written ({error.strerror}): give another folder.") from error
+    return work

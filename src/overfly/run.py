@@ -1,0 +1,323 @@
+"""Experiments: from a configuration to a run folder. The only module that knows Hydra.
+
+A run folder is movable and holds ``config.yaml``, ``overrides.txt``, ``train.log``, ``metrics.csv``, ``metrics.json``,
+``checkpoints/best.ckpt``, ``curves.png`` and ``clouds/``. A run of ``stage=all`` holds one such folder for each phase
+and, at its top, the results of the last one.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from overfly.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+log = logging.getLogger("overfly")
+
+BOUNDS = {"altitude": (20, 500), "overlap": (0, 95), "side_overlap": (0, 95)}
+UNITS = {"altitude": "metres above ground", "overlap": "percent", "side_overlap": "percent"}
+
+
+def conf_dir() -> Path:
+    """The folder of configurations: inside the installed package, else beside the source tree."""
+    here = Path(__file__).resolve().parent
+    return next(folder for folder in (here / "conf", here.parents[1] / "conf") if folder.is_dir())
+
+
+def register_resolvers() -> None:
+    """``${overfly.slug:text}`` makes a folder name, ``${overfly.user_cache:}`` names the user's cache folder."""
+
+    def slug(text: str) -> str:
+        kept = "".join(c if c.isalnum() or c in ".-_" else "-" for c in str(text).replace("=", "-"))
+        return kept[:80] or "run"
+
+    def user_cache() -> str:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        return str(Path(base) / "overfly")
+
+    OmegaConf.register_new_resolver("overfly.slug", slug, replace=True)
+    OmegaConf.register_new_resolver("overfly.user_cache", user_cache, replace=True)
+
+
+def check(cfg: DictConfig) -> None:
+    """Refuse values that no flight can have.
+
+    Raises:
+        InputError: ``altitude``, ``overlap`` or ``side_overlap`` is no number or out of bounds.
+    """
+    for key, (low, high) in BOUNDS.items():
+        values = cfg[key] if OmegaConf.is_list(cfg[key]) else [cfg[key]]
+        for value in values:
+            if value is None and key == "side_overlap":
+                continue
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not number or not (low <= value <= high):
+                raise InputError(
+                    f"{key}={value} is not possible: give {UNITS[key]}, a number from {low} to {high} "
+                    f"(or a list of them), for instance {key}={(low + high) // 2}."
+                )
+    if not isinstance(cfg.frames, int) or not 1 <= cfg.frames <= 8:
+        raise InputError(f"frames={cfg.frames} is not possible: a window has 1 to 8 frames, for instance frames=3.")
+
+
+def build(cfg: DictConfig) -> Any:
+    """Instantiate a part of the configuration, nested parts included: the one call of Hydra's ``instantiate``."""
+    from hydra.utils import instantiate
+
+    return instantiate(cfg, _convert_="all")
+
+
+def train(cfg: DictConfig) -> float | None:
+    """Train what ``stage`` says and return the best value of the monitored metric (None if none was measured)."""
+    check(cfg)
+    run_dir = Path(cfg.run_dir)
+    run_dir.mkdir(parents=True, exist_ok=True)
+    _save_config(cfg, run_dir)
+    log.info("The run folder is %s", run_dir)
+    if "phases" not in cfg:
+        return _train_stage(cfg)
+    value, before = None, cfg.from_run
+    for name, phase in cfg.phases.items():
+        part = OmegaConf.merge(cfg, phase, {"run_dir": str(run_dir / name), "from_run": before})
+        assert isinstance(part, DictConfig)
+        done = run_dir / name / "metrics.json"
+        if cfg.resume and done.is_file():
+            log.info("%s: finished before, its results in %s are kept", name, done.parent)
+            value = json.loads(done.read_text()).get("monitored")
+        else:
+            Path(part.run_dir).mkdir(parents=True, exist_ok=True)
+            _save_config(part, Path(part.run_dir))
+            value = _train_stage(part)
+        before = part.run_dir
+        _collect(run_dir, list(cfg.phases))
+    return value
+
+
+def _train_stage(cfg: DictConfig) -> float | None:
+    import lightning as L
+
+    from overfly.callbacks import finish_loggers
+
+    run_dir = Path(cfg.run_dir)
+    L.seed_everything(cfg.seed, workers=True, verbose=False)
+    stage = build(cfg.stage)
+    for line in warm_start(stage, cfg.stage_name, cfg.from_run):
+        log.info(line)
+    loggers = list(build(cfg.logger).values())
+    try:
+        data = build(cfg.data)
+        trainer = build(
+            OmegaConf.merge(cfg.trainer, {"callbacks": list(cfg.callbacks.values()), "logger": False})
+        )
+        trainer.loggers = [] if trainer.fast_dev_run else loggers
+        last = run_dir / "checkpoints" / "last.ckpt"
+        if cfg.resume and last.is_file():
+            log.info("%s: goes on from %s", cfg.stage_name, last)
+        resume_from = str(last) if cfg.resume and last.is_file() else None
+        trainer.fit(stage, datamodule=data, ckpt_path=resume_from, weights_only=True)
+        if trainer.interrupted:
+            raise KeyboardInterrupt
+        metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
+        best, monitored = _best(trainer, cfg.monitor, metrics)
+        if cfg.test and data.has_test:
+            results = trainer.test(stage, datamodule=data, ckpt_path=best, verbose=False, weights_only=True)
+            metrics |= {key: value for result in results for key, value in result.items()}
+        if trainer.is_global_zero:
+            _write_json(run_dir / "metrics.json", {"stage": cfg.stage_name, "monitor": cfg.monitor,
+                        "monitored": monitored, "epochs": trainer.current_epoch, "metrics": metrics})
+        shown = "was not measured" if monitored is None else f"is {monitored:.5g}"
+        log.info("%s: the best %s %s", cfg.stage_name, cfg.monitor, shown)
+        return monitored
+    finally:
+        finish_loggers(loggers)
+
+
+def _best(trainer: Any, monitor: str, metrics: dict[str, float]) -> tuple[str | None, float | None]:
+    """The best checkpoint (None under fast_dev_run: the weights in memory) and its monitored value."""
+    callback = trainer.checkpoint_callback
+    if trainer.fast_dev_run or callback is None or not callback.best_model_path:
+        value = metrics.get(monitor)
+        return None, value if value is not None and math.isfinite(value) else None
+    return callback.best_model_path, float(callback.best_model_score)
+
+
+def warm_start(stage: Any, name: str, from_run: str | None) -> list[str]:
+    """Start ``stage`` from another run's weights; one line for every part says where its weights came from."""
+    if from_run is None:
+        more = "" if name == "encoder" else f"; from_run=outputs/encoder/... starts {name} from a trained encoder"
+        return [f"{name}: every weight starts at random (seeded){more}"]
+    path = checkpoint(Path(from_run))
+    if path is None and name == "encoder":
+        raise InputError(f"from_run={from_run} holds no checkpoints/best.ckpt: give the folder of a finished run.")
+    if path is None:  # a phase under fast_dev_run leaves no checkpoint
+        return [f"{name}: {from_run} saved no checkpoint, so every weight starts at random (seeded)"]
+    lines: list[str] = stage.warm_start(read_weights(path), str(path))
+    return lines
+
+
+def checkpoint(folder: Path) -> Path | None:
+    """The best checkpoint of a run folder, None if there is none.
+
+    Raises:
+        InputError: the folder does not exist.
+    """
+    if folder.is_file():
+        return folder
+    if not folder.is_dir():
+        raise InputError(f"There is no run folder {folder}: give a folder that train.py wrote, such as outputs/all/...")
+    for part in (folder, folder / "full", folder / "gan", folder / "encoder"):
+        if (part / "checkpoints" / "best.ckpt").is_file():
+            return part / "checkpoints" / "best.ckpt"
+    return None
+
+
+def read_weights(path: Path) -> dict[str, torch.Tensor]:
+    """The state dict of a checkpoint (plain tensors only, nothing is unpickled)."""
+    import torch
+
+    weights: dict[str, torch.Tensor] = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
+    return weights
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: its network with the best weights in evaluation mode, and its resolved configuration."""
+
+    folder: Path
+    network: torch.nn.Module
+    config: dict[str, Any]
+    stage: str
+
+
+def load_run(folder: Path | str) -> Run:
+    """Open a run folder, wherever it was moved to.
+
+    Raises:
+        InputError: the folder is missing or holds no trained weights.
+    """
+    path = checkpoint(Path(folder))
+    if path is None:
+        raise InputError(f"{folder} holds no checkpoints/best.ckpt: train first (python train.py), then give its run folder.")
+    register_resolvers()
+    root = path.parent.parent
+    cfg = OmegaConf.load(root / "config.yaml")
+    assert isinstance(cfg, DictConfig)
+    network = build(cfg.model)
+    prefix = "network."
+    weights = {key[len(prefix) :]: value for key, value in read_weights(path).items() if key.startswith(prefix)}
+    network.load_state_dict(weights)
+    config = OmegaConf.to_container(cfg, resolve=False)
+    assert isinstance(config, dict)
+    return Run(folder=root, network=network.eval(), config={str(k): v for k, v in config.items()}, stage=cfg.stage_name)
+
+
+def _save_config(cfg: DictConfig, folder: Path) -> None:
+    """The configuration with every value filled in, without this machine's folders, so that the run can be moved."""
+    from hydra.core.hydra_config import HydraConfig
+
+    resolved = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
+    OmegaConf.set_struct(resolved, False)
+    for key in ("phases", "sweep"):
+        resolved.pop(key, None)
+    resolved.run_dir = "."
+    OmegaConf.resolve(resolved) if cfg.stage is not None else None
+    OmegaConf.save(resolved, folder / "config.yaml")
+    if HydraConfig.initialized():
+        overrides = HydraConfig.get().overrides.task
+        (folder / "overrides.txt").write_text("".join(f"{item}\n" for item in overrides))
+
+
+def _collect(run_dir: Path, phases: list[str]) -> None:
+    """Bring the phases' results to the top of a run of ``stage=all``: metrics, curves and the last best weights."""
+    from overfly.callbacks.curves import plot_curves
+    from overfly.tables import read_rows, write_rows
+
+    finished = [name for name in phases if (run_dir / name / "metrics.json").is_file()]
+    results = {name: json.loads((run_dir / name / "metrics.json").read_text()) for name in finished}
+    if not results:
+        return
+    _write_json(run_dir / "metrics.json", {"stage": "all", "monitored": results[finished[-1]]["monitored"],
+                "monitor": results[finished[-1]]["monitor"], "phases": results})
+    rows = {name: read_rows(run_dir / name / "metrics.csv") for name in finished}
+    lines: list[dict[str, Any]] = [{"stage": name, **row} for name, part in rows.items() for row in part]
+    if lines:
+        write_rows(run_dir / "metrics.csv", lines)
+        plot_curves({name: part for name, part in rows.items() if part}, run_dir / "curves.png")
+    last = run_dir / finished[-1]
+    shutil.copy(last / "config.yaml", run_dir / "config.yaml")
+    for source in [*last.glob("checkpoints/best.ckpt"), *last.glob("clouds/*")]:
+        target = run_dir / source.relative_to(last)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(source, target)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def _resumed(argv: Sequence[str]) -> list[str]:
+    """With ``resume=RUN``, put that run's own overrides first and go on in its folder."""
+    folder = next((Path(item.removeprefix("resume=")) for item in argv if item.startswith("resume=")), None)
+    if folder is None or str(folder) in ("null", ""):
+        return list(argv)
+    recorded = folder / "overrides.txt"
+    if not recorded.is_file():
+        raise InputError(
+            f"resume={folder} is not a run folder (it has no overrides.txt): give one that train.py wrote, "
+            "such as resume=outputs/all/2026-01-31_12-00-00-000000."
+        )
+    kept = [line for line in recorded.read_text().splitlines() if line and not line.startswith("resume=")]
+    return [*kept, *argv, f"hydra.run.dir={folder}"]
+
+
+def explain(error: BaseException) -> str | None:
+    """One sentence for what the user can mend: what was given, and what is allowed. None for a bug."""
+    from hydra.errors import ConfigCompositionException, MissingConfigException
+    from omegaconf.errors import OmegaConfBaseException
+
+    chain: list[BaseException] = [error]
+    while (cause := chain[-1].__cause__) is not None:
+        chain.append(cause)
+    for link in chain:
+        if isinstance(link, InputError):
+            return str(link)
+    text = " ".join(" ".join(str(link).split()) for link in chain[:2])
+    if isinstance(error, MissingConfigException):
+        return text
+    if isinstance(error, ConfigCompositionException | OmegaConfBaseException):
+        return f"The configuration refuses this: {text}. Type `python train.py --cfg job` to see every key."
+    return None
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """``python train.py [overrides]`` and ``overfly train [overrides]``; returns the exit code (0, 1 or 2)."""
+    import hydra
+
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to us, and we say them in one sentence
+    register_resolvers()
+    try:
+        sys.argv = ["train.py", *_resumed(sys.argv[1:] if argv is None else argv)]
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")(train)()
+    except KeyboardInterrupt:
+        print("Stopped. What is finished is kept; resume=<the run folder> goes on from the last epoch.", file=sys.stderr)
+        return 130
+    except Exception as error:
+        sentence = explain(error)
+        if sentence is None:
+            raise
+        print(f"Error: {sentence}", file=sys.stderr)
+        return 2
+    return 0

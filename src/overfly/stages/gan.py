@@ -1,0 +1,179 @@
+"""Phase two: generator and discriminator, alternately, on a trained encoder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from overfly import losses
+from overfly.stages.clouds import window_emd, window_metrics
+from overfly.stages.stage import Batch, OptimizerFactory, Stage, log
+
+
+class GanStage(Stage):
+    """Alternating optimisation of ``network.generator`` and ``network.discriminator`` (section 3.3, Eq. 1).
+
+    Each batch is one step of the discriminator on the clouds as they are, then one of the generator. *Accuracy* is the
+    share of clouds, real and generated, that the discriminator calls right.
+
+    Args:
+        discriminator_optimizer: as ``optimizer``, for the second player.
+        freeze_encoder: keep the encoder's weights and batch statistics; an encoder that was never trained is always
+            trained along (a frozen random one would hide the images from the generator), and a line says so.
+        emd_points: size of the random subsets on which the ``emd`` term is computed (0.08 s a window at 1024).
+        emd_batches: validation and test batches on which the exact EMD is measured.
+        others: see :class:`overfly.stages.stage.Stage`.
+    """
+
+    terms: ClassVar[tuple[str, ...]] = ("chamfer", "emd", "adversarial", "adversarial_eq1")
+    accuracy: ClassVar[str] = "discriminator_accuracy"
+
+    def __init__(
+        self,
+        *,
+        discriminator_optimizer: OptimizerFactory,
+        freeze_encoder: bool,
+        emd_points: int,
+        emd_batches: int,
+        **others: Any,
+    ) -> None:
+        super().__init__(**others)
+        self.discriminator_optimizer_factory = discriminator_optimizer
+        self.freeze_encoder, self.emd_points, self.emd_batches = freeze_encoder, emd_points, emd_batches
+        self.frozen: bool | None = None  # decided when the training begins, kept in checkpoints
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        # A frozen encoder is in the list too: then a checkpoint fits whether it was frozen or not.
+        generator = [*self.part("encoder").parameters(), *self.part("generator").parameters()]
+        return [
+            self.optimizer_factory(generator),
+            self.discriminator_optimizer_factory(self.part("discriminator").parameters()),
+        ]
+
+    def warm_start(self, state: Mapping[str, Tensor], source: str) -> list[str]:
+        lines = super().warm_start(state, source)
+        if not int(self.part("generator").steps):
+            lines = [line for line in lines if not line.startswith("generator")]
+            lines.append(self._blocks_from_encoder())
+        return lines
+
+    def setup(self, stage: str) -> None:
+        if stage == "fit" and not int(self.part("generator").steps):
+            line = self._blocks_from_encoder()
+            if not int(self.part("encoder").steps):
+                log.info("%s, which itself starts at random (seeded)", line)
+
+    def on_fit_start(self) -> None:
+        if self.frozen is None:
+            self.frozen = self.freeze_encoder and int(self.part("encoder").steps) > 0
+            if self.freeze_encoder and not self.frozen:
+                log.info("encoder: not trained yet, so it is trained along with the generator instead of being frozen")
+        self.part("encoder").requires_grad_(not self.frozen)
+        self.train()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["encoder_frozen"] = bool(self.frozen)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.frozen = bool(checkpoint["encoder_frozen"])
+
+    def train(self, mode: bool = True) -> GanStage:
+        super().train(mode)
+        if self.frozen:
+            self.part("encoder").eval()
+        return self
+
+    def training_step(self, batch: Batch, batch_idx: int) -> None:
+        output = self.network(batch)
+        cloud, real = output["points"], batch["reference"]
+        players = self.optimizers()
+        assert isinstance(players, list)
+        judged = None
+        if self._adversarial():
+            judged = self._discriminator_step(players[1], cloud.detach(), real, batch_idx)
+        with self.toggled_optimizer(players[0]):
+            random = self.random(batch_idx)
+            terms = {**self._cloud_terms(cloud, real, random), **self._more_terms(output, batch, random)}
+            loss = self.total(terms)
+            parts = ["generator"] if self.frozen else ["encoder", "generator"]
+            self.optimise(players[0], loss, batch_idx, parts)
+        self._report_losses("train", loss, terms, len(real))
+        self._report_clouds("train", cloud, batch)
+        if judged is not None:
+            self._report_players("train", *judged)
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self._evaluate(batch, batch_idx, "val")
+
+    def test_step(self, batch: Batch, batch_idx: int) -> None:
+        self._evaluate(batch, batch_idx, "test")
+
+    def _discriminator_step(self, optimizer: Any, cloud: Tensor, real: Tensor, batch_idx: int) -> tuple[Tensor, Tensor]:
+        with self.toggled_optimizer(optimizer):
+            on_real, on_cloud = self._logits(real), self._logits(cloud)
+            self.optimise(optimizer, losses.discriminator(on_real, on_cloud).mean(), batch_idx, ["discriminator"])
+        return on_real.detach(), on_cloud.detach()
+
+    def _cloud_terms(self, cloud: Tensor, real: Tensor, random: torch.Generator) -> dict[str, Tensor]:
+        terms = {}
+        if "chamfer" in self.weights:
+            terms["chamfer"] = losses.chamfer(cloud, real)
+        if "emd" in self.weights:
+            chosen = [torch.randperm(x.shape[1], generator=random)[: self.emd_points].to(x.device) for x in (cloud, real)]
+            terms["emd"] = losses.emd(cloud[:, chosen[0]], real[:, chosen[1]])
+        if self._adversarial():
+            logits = self._logits(cloud)
+            for name in ("adversarial", "adversarial_eq1"):
+                if name in self.weights:
+                    terms[name] = getattr(losses, name)(logits)
+        return terms
+
+    def _more_terms(self, output: dict[str, Tensor], batch: Batch, random: torch.Generator) -> dict[str, Tensor]:
+        return {}
+
+    def _evaluate(self, batch: Batch, batch_idx: int, split: str) -> None:
+        output = self.network(batch)
+        cloud, real = output["points"], batch["reference"]
+        random = self.random(batch_idx, epoch=0)
+        terms = {**self._cloud_terms(cloud, real, random), **self._more_terms(output, batch, random)}
+        self._report_losses(split, self.total(terms), terms, len(real))
+        self._report_clouds(split, cloud, batch)
+        if self._adversarial():
+            self._report_players(split, self._logits(real), self._logits(cloud))
+        if batch_idx < self.emd_batches and cloud.shape[1] == real.shape[1]:
+            pairs = zip(cloud.cpu().numpy(), real.cpu().numpy(), strict=True)
+            values = [window_emd(a, b) for a, b in pairs]
+            self.report(split, {"emd_sum_1024": sum(values) / len(values)}, len(values))
+
+    def _adversarial(self) -> bool:
+        return "adversarial" in self.weights or "adversarial_eq1" in self.weights
+
+    def _logits(self, points: Tensor) -> Tensor:
+        logits: Tensor = self.network.discriminator.logits(points)  # type: ignore[union-attr, operator]
+        return logits
+
+    def _blocks_from_encoder(self) -> str:
+        line: str = self.network.generator.start_from(self.network.encoder)  # type: ignore[union-attr, operator]
+        return line
+
+    def _report_losses(self, split: str, loss: Tensor, terms: dict[str, Tensor], count: int) -> None:
+        named = {f"loss_{name}": value.detach().mean() for name, value in terms.items()}
+        self.report(split, {"loss": loss.detach(), **named}, count)
+
+    def _report_clouds(self, split: str, cloud: Tensor, batch: Batch) -> None:
+        arrays = (x.detach().cpu().numpy() for x in (cloud, batch["reference"], batch["scale"]))
+        rows = [window_metrics(*window) for window in zip(*arrays, strict=True)]
+        self._report(split, {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}, len(rows))
+
+    def _report_players(self, split: str, on_real: Tensor, on_cloud: Tensor) -> None:
+        right = ((on_real > 0).float().mean() + (on_cloud < 0).float().mean()) / 2
+        loss = losses.discriminator(on_real, on_cloud).mean()
+        self._report(split, {"loss_discriminator": loss, "discriminator_accuracy": right}, len(on_real))
+
+    def _report(self, split: str, values: dict[str, Any], count: int) -> None:
+        if self.accuracy in values:
+            values["accuracy"] = values[self.accuracy]
+        self.report(split, values, count)

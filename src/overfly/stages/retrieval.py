@@ -1,0 +1,54 @@
+"""Retrieval top-1 over a whole split, where a hit is a frame that sees common ground."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+
+
+class RetrievalTop1(Metric):
+    """Share of frames whose nearest other frame, by descriptor, overlaps them on the ground.
+
+    The gallery of a frame is its own window and all windows of other scenes; other windows of its own scene are left
+    out, since how much they overlap it is unknown. Frames that overlap no other are not asked. NaN before any was.
+    """
+
+    full_state_update = False
+    higher_is_better = True
+    descriptors: list[Tensor]
+    overlaps: list[Tensor]
+    scenes: list[Tensor]
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in ("descriptors", "overlaps", "scenes"):
+            self.add_state(name, [], dist_reduce_fx="cat")
+
+    def update(self, descriptors: Tensor, overlaps: Tensor, scenes: Tensor) -> None:
+        """Add windows: descriptors [B, K, D], overlaps [B, K, K], scenes [B]."""
+        self.descriptors.append(descriptors.detach())
+        self.overlaps.append(overlaps)
+        self.scenes.append(scenes)
+
+    def compute(self) -> Tensor:
+        if not self.descriptors:
+            return torch.tensor(float("nan"))
+        descriptors, overlaps, scenes = (dim_zero_cat(x) for x in (self.descriptors, self.overlaps, self.scenes))
+        n, k = descriptors.shape[:2]
+        gallery, frame_scene = descriptors.flatten(0, 1), scenes.repeat_interleave(k)
+        window = torch.arange(n, device=scenes.device).repeat_interleave(k)
+        itself = torch.eye(k, dtype=torch.bool, device=scenes.device)
+        hits = asked = 0
+        for w in range(n):  # a window at a time: the whole matrix would grow with the square of the split
+            likeness = descriptors[w] @ gallery.T  # [K, n K]
+            likeness[:, (frame_scene == scenes[w]) & (window != w)] = -torch.inf
+            likeness[:, w * k : (w + 1) * k].masked_fill_(itself, -torch.inf)
+            best = likeness.argmax(1)
+            common = (overlaps[w] > 0) & ~itself
+            own = (best // k) == w
+            hit = own & common.gather(1, torch.where(own, best % k, torch.zeros_like(best))[:, None])[:, 0]
+            some = common.any(1)
+            hits, asked = hits + int((hit & some).sum()), asked + int(some.sum())
+        return torch.tensor(hits / asked if asked else float("nan"))

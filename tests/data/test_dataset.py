@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from plane import CAMERA, make_record, surface
+from overfly.data.dataset import WindowDataset, WindowSampler, WindowSettings, reference_points
+from overfly.data.record import write_record
+from overfly.data.windows import to_world, window_frame
+from overfly.errors import InputError
+
+SETTINGS = WindowSettings(
+    frames=3, points=256, choice="overlap", ground_sigma_m=0.0, position_sigma_m=1.0, rotation_sigma_deg=1.0
+)
+
+
+def dataset(folder: Path, augment: bool = True, seed: int = 5) -> WindowDataset:
+    return WindowDataset([folder], SETTINGS, seed=seed, augment=augment)
+
+
+def test_an_item_has_the_shapes_and_types_of_the_contract(record_folder: Path) -> None:
+    item = dataset(record_folder)[0, 2]
+    shapes = {name: tuple(value.shape) for name, value in item.items()}
+    assert shapes["images"] == (3, 3, 24, 32)
+    assert shapes["depth"] == (3, 24, 32)
+    assert shapes["reference"] == (256, 3)
+    assert shapes["camera_from_window"] == shapes["prior_from_window"] == (3, 4, 4)
+    assert shapes["scale"] == shapes["scene"] == ()
+    assert item["reference"].dtype == item["depth"].dtype == torch.float32
+    assert int(item["scene"]) == 3
+
+
+def test_reference_and_depth_are_the_same_surface(record_folder: Path) -> None:
+    item = dataset(record_folder)[0, 2]
+    scale = float(item["scale"])
+    points = item["reference"].numpy().astype(float)
+    # The camera faces north, so window axes are the world's; the frame stands over x = 0.
+    np.testing.assert_allclose(points[:, 2] * scale, surface(points * scale), atol=0.06)
+    assert points[:, :2].min() > -1
+    assert points[:, :2].max() < 1
+    # Each point projected into the first frame meets the depth map there.
+    camera = item["camera_from_window"][0].numpy().astype(float)
+    local = points @ camera[:3, :3].T + camera[:3, 3]
+    pixels = local @ item["intrinsics"][0].numpy().T
+    uv = (pixels[:, :2] / pixels[:, 2:]).astype(int)
+    inside = (uv >= 0).all(1) & (uv[:, 0] < CAMERA.width) & (uv[:, 1] < CAMERA.height)
+    assert inside.sum() > 100
+    depth = item["depth"][0].numpy()[uv[inside, 1], uv[inside, 0]]
+    np.testing.assert_allclose(local[inside, 2], depth, rtol=0.01)
+
+
+def test_randomness_depends_on_seed_epoch_and_index_alone(record_folder: Path) -> None:
+    first, second = dataset(record_folder), dataset(record_folder)
+    _ = first[0, 1]  # drawing another item before changes nothing
+    torch.testing.assert_close(first[4, 2]["reference"], second[4, 2]["reference"], rtol=0, atol=0)
+    assert not torch.equal(first[4, 2]["reference"], first[5, 2]["reference"])
+    assert not torch.equal(first[4, 2]["reference"], dataset(record_folder, seed=6)[4, 2]["reference"])
+    fixed = dataset(record_folder, augment=False)
+    torch.testing.assert_close(fixed[4, 2]["reference"], fixed[5, 2]["reference"], rtol=0, atol=0)
+
+
+def test_priors_are_wrong_by_what_was_asked(record_folder: Path) -> None:
+    data = dataset(record_folder)
+    errors = []
+    for epoch in range(40):
+        item = data[epoch, 2]
+        scale = float(item["scale"])
+        true, prior = (torch.linalg.inv(item[k].double()) for k in ("camera_from_window", "prior_from_window"))
+        errors.append((true - prior)[:, :3, 3].numpy() * scale)
+    assert np.std(errors) == pytest.approx(1.0, abs=0.15)
+
+
+def test_consecutive_windows_follow_time(tmp_path: Path) -> None:
+    write_record(make_record(), tmp_path / "r")
+    settings = WindowSettings(
+        frames=3, points=16, choice="consecutive", ground_sigma_m=0, position_sigma_m=0, rotation_sigma_deg=0
+    )
+    windows = [window for _, window in WindowDataset([tmp_path / "r"], settings, seed=0, augment=False).windows]
+    assert windows == [[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5], [4, 3, 5], [5, 3, 4]]
+
+
+def test_a_reference_that_misses_the_window_is_an_error() -> None:
+    record = make_record()
+    frame, scale = window_frame(CAMERA, record.world_from_camera[0], 0.0)
+    frame[0, 3] = 5000
+    with pytest.raises(InputError, match="less than a tenth"):
+        reference_points(record, frame, scale, 64, np.random.default_rng(0))
+
+
+def test_points_keep_their_metres(record_folder: Path) -> None:
+    record = make_record()
+    frame, scale = window_frame(CAMERA, record.world_from_camera[2], 0.0)
+    points = reference_points(record, frame, scale, 64, np.random.default_rng(0))
+    world = to_world(points, frame, scale)
+    np.testing.assert_allclose(world[:, 2], surface(world), atol=0.06)
+    width = 2 * 100 * np.tan(np.radians(35))  # of the footprint of a 70 degree camera at 100 m
+    assert 2 * scale == pytest.approx(width, rel=1e-6)
+
+
+def test_an_unknown_choice_is_an_error() -> None:
+    with pytest.raises(InputError, match="overlap or consecutive"):
+        WindowSettings(frames=3, points=1, choice="best", ground_sigma_m=0, position_sigma_m=0, rotation_sigma_deg=0)
+
+
+@pytest.mark.parametrize("world", [1, 3])
+def test_the_sampler_covers_every_window_once_in_an_order_of_its_own(world: int) -> None:
+    samplers = [WindowSampler(10, seed=1, shuffle=True, rank=rank, world=world) for rank in range(world)]
+    drawn = [list(sampler) for sampler in samplers]
+    counts = Counter(index for part in drawn for _, index in part)
+    assert set(counts) == set(range(10))
+    assert len({len(part) for part in drawn}) == 1
+    assert sum(counts.values()) < 10 + world
+    again = list(samplers[0])
+    assert again == drawn[0]
+    samplers[0].set_epoch(1)
+    assert list(samplers[0]) != drawn[0]
+    assert all(epoch == 1 for epoch, _ in samplers[0])
