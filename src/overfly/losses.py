@@ -64,6 +64,7 @@ def emd(predicted: Tensor, target: Tensor) -> Tensor:
     apart = squared > 0  # the root has no finite derivative at 0
     return torch.where(apart, torch.where(apart, squared, 1.0).sqrt(), 0.0).mean(1)
 
+
 def correspondence(queries: Tensor, match_map: Tensor, places: Tensor, temperature: float = 0.07) -> Tensor:
     """InfoNCE (van den Oord et al. 2018) of descriptors against every cell of the other image's match map.
 
@@ -81,17 +82,20 @@ def correspondence(queries: Tensor, match_map: Tensor, places: Tensor, temperatu
         [P, M], nats; log(h w) for a map that knows nothing.
     """
     h, w = match_map.shape[2:]
-    logits = queries @ match_map.flatten(2) / temperature  # [P, M, h w]
+    queries = queries / temperature  # [P, M, C]
+    cells = match_map.flatten(2).transpose(1, 2)  # [P, h w, C]
     u = (places[..., 0] - 0.5).clamp(0, w - 1)
     v = (places[..., 1] - 0.5).clamp(0, h - 1)
     left, top = u.floor().clamp(max=max(w - 2, 0)).long(), v.floor().clamp(max=max(h - 2, 0)).long()
     fu, fv = u - left, v - top
-    expected = torch.zeros_like(u)
+    expected = torch.zeros_like(queries)  # the mean of the right cells' descriptors: its logit is theirs, weighted
     for dx, wx in ((0, 1 - fu), (1, fu)):
         for dy, wy in ((0, 1 - fv), (1, fv)):
             cell = (top + dy).clamp(max=h - 1) * w + (left + dx).clamp(max=w - 1)
-            expected = expected + wx * wy * logits.gather(2, cell[..., None])[..., 0]
-    return logits.logsumexp(2) - expected
+            expected = expected + (wx * wy)[..., None] * cells.gather(1, cell[..., None].expand_as(queries))
+    # One pair at a time: its logits [M, h w] stay in the cache, those of all pairs do not.
+    every = torch.stack([(q @ c.T).logsumexp(1) for q, c in zip(queries, cells, strict=True)])
+    return every - (queries * expected).sum(2)
 
 
 def retrieval(descriptors: Tensor, positive: Tensor, negative: Tensor, temperature: float = 0.1) -> Tensor:

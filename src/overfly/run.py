@@ -13,7 +13,8 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,7 +112,10 @@ def _train_stage(cfg: DictConfig) -> float | None:
 
     from overfly.callbacks import finish_loggers
 
+    _quieten()
     run_dir = Path(cfg.run_dir)
+    # The learning rate falls over the epochs that are trained, whoever set their number.
+    cfg = OmegaConf.merge(cfg, {"stage": {"epochs": cfg.trainer.max_epochs}})  # type: ignore[assignment]
     L.seed_everything(cfg.seed, workers=True, verbose=False)
     stage = build(cfg.stage)
     for line in warm_start(stage, cfg.stage_name, cfg.from_run):
@@ -119,9 +123,7 @@ def _train_stage(cfg: DictConfig) -> float | None:
     loggers = list(build(cfg.logger).values())
     try:
         data = build(cfg.data)
-        trainer = build(
-            OmegaConf.merge(cfg.trainer, {"callbacks": list(cfg.callbacks.values()), "logger": False})
-        )
+        trainer = build(OmegaConf.merge(cfg.trainer, {"callbacks": list(cfg.callbacks.values())}))
         trainer.loggers = [] if trainer.fast_dev_run else loggers
         last = run_dir / "checkpoints" / "last.ckpt"
         if cfg.resume and last.is_file():
@@ -134,7 +136,7 @@ def _train_stage(cfg: DictConfig) -> float | None:
         best, monitored = _best(trainer, cfg.monitor, metrics)
         if cfg.test and data.has_test:
             results = trainer.test(stage, datamodule=data, ckpt_path=best, verbose=False, weights_only=True)
-            metrics |= {key: value for result in results for key, value in result.items()}
+            metrics |= _by_split(results, data.test_splits)
         if trainer.is_global_zero:
             _write_json(run_dir / "metrics.json", {"stage": cfg.stage_name, "monitor": cfg.monitor,
                         "monitored": monitored, "epochs": trainer.current_epoch, "metrics": metrics})
@@ -143,6 +145,28 @@ def _train_stage(cfg: DictConfig) -> float | None:
         return monitored
     finally:
         finish_loggers(loggers)
+
+
+def _by_split(results: Sequence[Mapping[str, float]], splits: Sequence[str]) -> dict[str, float]:
+    """Lightning's test results, one dict a loader, under the names of the splits: ``test/...`` and ``unseen/...``."""
+    named = {}
+    for split, result in zip(splits, results, strict=True):
+        for key, value in result.items():
+            what = key.removeprefix("test/").split("/dataloader_idx_")[0]
+            named[f"{split}/{what}"] = float(value)
+    return named
+
+
+def _quieten() -> None:
+    """Leave out what Lightning says on every run; our own lines say what matters."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (
+        r".*isinstance\(treespec, LeafSpec\).*",  # Lightning's own use of torch
+        r".*does not have many workers.*",  # small data: loading is not what training waits for
+        r".*module\(s\) in eval mode at the start of training.*",  # the frozen encoder
+    ):
+        warnings.filterwarnings("ignore", message)
 
 
 def _best(trainer: Any, monitor: str, metrics: dict[str, float]) -> tuple[str | None, float | None]:

@@ -26,6 +26,7 @@ def plot_curves(stages: dict[str, list[Row]], path: Path) -> None:
         path: the PNG to write.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(4 * len(PANELS), 2.9 * len(stages)), layout="constrained")
     axes = figure.subplots(len(stages), len(PANELS), squeeze=False)
@@ -43,6 +44,7 @@ def plot_curves(stages: dict[str, list[Row]], path: Path) -> None:
                 continue
             axis.set(title=f"{stage}: {title}", xlabel="epoch")
             axis.title.set_fontsize(9)
+            axis.xaxis.set_major_locator(MaxNLocator(integer=True))
             axis.grid(alpha=0.3)
             if key == "accuracy":
                 axis.set_ylim(0, 1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from overfly.cloud import Cloud, write_cloud
+from overfly.stages import GanStage
 
 Batch = dict[str, torch.Tensor]
 
@@ -129,12 +130,12 @@ class Predictions(L.Callback):
 
 def predicted_points(stage: L.LightningModule, batch: Batch) -> NDArray[np.float32] | None:
     """The stage's clouds for a batch [B, N, 3] in window units; None from a stage that predicts none."""
-    if not getattr(stage, "predicts_clouds", False):
+    if not isinstance(stage, GanStage):
         return None
     training = stage.training
     stage.eval()
     with torch.no_grad():
-        points = stage.network(batch)["points"]  # type: ignore[operator]
+        points = stage(batch)["points"]
     stage.train(training)
     return np.asarray(points.float().cpu().numpy())
 

@@ -246,20 +246,21 @@ def record_flight(job: FlightJob) -> Record:
             camera=camera,
             ground=scene.ground,
             rng=rng,
+            frames=max(2, job.images - frames),
             **{key: value for key, value in job.flight_path.items() if key != "name"},
         )
         plans.append(plan)
-        frames += len(plan.world_from_camera)
+        frames += len(plan)
     if frames < job.images:
         raise InputError(
             f"A {job.flight_path['name']} flight at {job.altitude:g} m with {job.overlap:g} % overlap has only {frames} "
             f"frames in this scene: ask for at most {frames} images_per_flight."
         )
     poses = np.concatenate([plan.world_from_camera for plan in plans])[: job.images]
-    strips = np.concatenate([1000 * i + np.asarray(plan.strips) for i, plan in enumerate(plans)])[: job.images]
+    strips = np.concatenate([1000 * i + plan.strip for i, plan in enumerate(plans)])[: job.images]
     renderer = Renderer(scene)
     appearance = Appearance(
-        sun_azimuth_deg=float(rng.uniform(0, 360)), sun_elevation_deg=float(rng.uniform(30, 70)), noise_std=0.01
+        sun_azimuth_deg=float(rng.uniform(0, 360)), sun_elevation_deg=float(rng.uniform(30, 70)), noise_std=2.0
     )
     shots = [
         renderer.render(camera, pose, supersample=job.supersample, appearance=appearance, rng=rng) for pose in poses
@@ -274,7 +275,7 @@ def record_flight(job: FlightJob) -> Record:
         strips=strips.astype(np.int64),
         heights=heights,
         corner=(float(low[0]), float(high[1]), cell),
-        ground_height=float(np.mean(scene.ground(poses[:, :2, 3]))),
+        ground_height=float(np.mean([plan.ground_height for plan in plans])),
         facts={
             **asdict(job),
             "flight_path": job.flight_path["name"],

@@ -46,10 +46,8 @@ class CameraPreset:
         for what, size in (("width", w), ("height", h)):
             if isinstance(size, bool) or not isinstance(size, int) or not 16 <= size <= 100_000:
                 raise InputError(f"The image {what} {size!r} is not allowed: give whole pixels from 16 to 100000.")
-        if width is None or height is None:
-            scale = w / full_w  # the rounded other side cuts or adds a fraction of a pixel
-        else:
-            scale = max(w / full_w, h / full_h)
+        # Of two sides one rules; where only one was given, the other is rounded by a fraction of a pixel.
+        scale = w / full_w if width is None or height is None else max(w / full_w, h / full_h)
         focal = self.focal_mm / self.sensor_mm[0] * full_w * scale
         return Camera(w, h, focal, focal, w / 2, h / 2)
 

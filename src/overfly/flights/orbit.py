@@ -77,7 +77,7 @@ def circular(site: Site, overlap: float, side_overlap: float, heading_deg: float
                 # The pairs really flown, not those all around, shall have the asked mean.
                 k = np.arange(count - 1)
                 step = spacing_for(lambda x: measured(r, first + k * x, x), step, overlap)  # noqa: B023
-            azimuths.append(first + step * np.arange(count))
+            azimuths.append(first + step * np.arange(count, dtype=float))
             steps.append(step)
             total += count
         return radii[: len(azimuths)], azimuths, steps

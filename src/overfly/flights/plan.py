@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from overfly.errors import InputError, unknown
 from overfly.flights.footprint import Ground, pair_overlap
 from overfly.flights.orbit import circular
-from overfly.flights.paths import double_grid, grid, random_walk
+from overfly.flights.paths import double_grid, grid
 from overfly.flights.site import Area, Site
+from overfly.flights.walk import random_walk
 from overfly.geometry import Array, Camera
 
 PATHS = ("circular", "grid", "double_grid", "random")

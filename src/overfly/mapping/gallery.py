@@ -15,7 +15,7 @@ from overfly.mapping import pictures
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Picture
 
-FLAT = 100_000
+SHOWN = 2_000_000
 """Points kept for the oblique picture: more would not be seen in it."""
 
 
@@ -44,6 +44,7 @@ def gallery(
     *,
     gsd: float,
     unit: str,
+    height_offset: float = 0.0,
     missing: Sequence[tuple[str, NDArray]] = (),
 ) -> tuple[list[Picture], Surface]:
     """All pictures of a report.
@@ -53,31 +54,34 @@ def gallery(
         cameras, poses, names: registered frames, poses [n, 4, 4], in the order of the flight.
         gsd: ground sampling distance.
         unit: of lengths, for the scale bars.
+        height_offset: height of the product minus z here.
         missing: name and position [>=2] of frames that were not registered.
     """
     seen = pictures.overview(cloud, min_cell=2 * gsd)
     ground = float(np.nanmedian(seen.heights))
     outlines = [footprint(camera, pose, ground) for camera, pose in zip(cameras, poses, strict=True)]
     views = views_per_cell(seen, cameras, poses)
-    near = cloud if len(cloud) <= 20 * FLAT else cloud[:: len(cloud) // (20 * FLAT) + 1]
+    shown_points = cloud
+    if len(cloud) > SHOWN:
+        shown_points = cloud[np.random.default_rng(0).choice(len(cloud), SHOWN, replace=False)]
     shown = [
         Picture(
             "The map",
             "From above",
             "Colours of the cloud seen straight from above; north is up. White: nothing measured.",
-            pictures.jpeg(pictures.top_view(seen)),
+            pictures.jpeg(enlarged(pictures.top_view(seen))),
         ),
         Picture(
             "The map",
             "Heights",
             "Surface heights over a hillshade (light from the north-west).",
-            pictures.png(pictures.height_map(seen, unit=unit)),
+            pictures.png(pictures.height_map(seen, offset=height_offset, unit=unit)),
         ),
         Picture(
             "In perspective",
             "The cloud from the south",
             "Every point with its own colour, as stored in cloud.laz.",
-            pictures.jpeg(pictures.oblique_view(near)),
+            pictures.jpeg(pictures.oblique_view(shown_points)),
         ),
         Picture(
             "The flight",
@@ -88,7 +92,7 @@ def gallery(
         Picture(
             "The flight",
             "Overlap",
-            "How many images have a place inside their frame. Two are needed to measure; three or more make it reliable.",
+            "How many images have a place inside their frame. Two are needed to measure, three make it reliable.",
             pictures.png(pictures.views_map(seen.grid, views, unit=unit)),
         ),
     ]
@@ -98,6 +102,12 @@ def gallery(
         caption = "Where the surface was measured, and where it is only predicted: do not measure there."
         shown.append(Picture("Measured and predicted", "Measured and predicted ground", caption, pictures.png(picture)))
     return shown, replace(seen, views=views)
+
+
+def enlarged(image: NDArray[np.uint8], pixels: int = 700) -> NDArray[np.uint8]:
+    """Cells as squares of whole pixels, until the longer side has at least ``pixels``."""
+    factor = -(-pixels // max(image.shape[:2]))
+    return image.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def views_per_cell(seen: Surface, cameras: Sequence[Camera], poses: Array) -> NDArray[np.float64]:

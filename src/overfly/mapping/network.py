@@ -233,7 +233,8 @@ def agreement(points: NDArray, window: NDArray, gsd: float, neighbours: int = 12
     k = min(neighbours + 1, len(points))
     if k < 2:
         return np.full(len(points), gsd), np.zeros(len(points))
-    near = cKDTree(points[:, :2]).query(points[:, :2], k=k)[1][:, 1:]
+    _, found = cKDTree(points[:, :2]).query(points[:, :2], k=k)
+    near = np.asarray(found)[:, 1:]
     rise = np.abs(points[near, 2] - points[:, None, 2])
     foreign = window[near] != window[:, None]
     asked = foreign.any(1)

@@ -38,7 +38,7 @@ def oblique_view(
     local, depth, colors = local[visible], depth[visible], colors[visible]
     plane = local[:, :2] / depth[:, None] * focal
     low, high = np.quantile(plane, [0.002, 0.998], axis=0)
-    zoom = min(0.94 * width / max(high[0] - low[0], 1e-9), 0.92 * height / max(high[1] - low[1], 1e-9))
+    zoom = min(0.91 * width / max(high[0] - low[0], 1e-9), 0.9 * height / max(high[1] - low[1], 1e-9))
     u, v = ((plane - (low + high) / 2) * zoom + [width / 2, height / 2]).T
     focal *= zoom
     spacing = np.sqrt(4 * spread[0] * spread[1] / max(len(points), 1)) / distance * focal

@@ -86,19 +86,21 @@ def hillshade(seen: Surface, *, azimuth_deg: float = 315.0, elevation_deg: float
     return np.where(seen.filled, np.clip(normal @ light, 0, 1), 1.0)
 
 
-def height_map(seen: Surface, *, unit: str = "m", width_in: float = 7.2) -> Image:
-    """Heights in colour over a hillshade, with colour bar, scale bar and north arrow."""
+def height_map(seen: Surface, *, offset: float = 0.0, unit: str = "m", width_in: float = 5.6) -> Image:
+    """Heights (plus ``offset``) in colour over a hillshade, with colour bar, scale bar and north arrow."""
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
 
     figure, axes = _map_figure(seen.grid, width_in)
     values = seen.heights[seen.filled]
     low, high = (float(v) for v in np.percentile(values, [0.5, 99.5])) if values.size else (0.0, 1.0)
-    norm, colours = Normalize(low, max(high, low + 1e-6)), colormaps["turbo"]
+    high = max(high, low + 1e-6)
+    norm, colours = Normalize(low, high), colormaps["turbo"]
     shaded = colours(norm(np.nan_to_num(seen.heights, nan=low)))[..., :3]
     shaded = shaded * (0.35 + 0.65 * np.minimum(hillshade(seen) / 0.72, 1.2))[..., None]
     shaded = np.where(seen.filled[..., None], np.clip(shaded, 0, 1), 1.0)
     axes.imshow(shaded, extent=seen.grid.extent, interpolation="nearest")
+    norm = Normalize(low + offset, high + offset)
     bar = figure.colorbar(_mappable(norm, colours), ax=axes, shrink=0.8, pad=0.02, aspect=30)
     bar.set_label(f"height ({unit})", color=INK)
     bar.outline.set_visible(False)
@@ -107,7 +109,7 @@ def height_map(seen: Surface, *, unit: str = "m", width_in: float = 7.2) -> Imag
 
 
 def views_map(
-    grid: Grid, views: ArrayLike, *, unit: str = "m", width_in: float = 7.2, outlines: Sequence[Array] = ()
+    grid: Grid, views: ArrayLike, *, unit: str = "m", width_in: float = 5.6, outlines: Sequence[Array] = ()
 ) -> Image:
     """How many frames see each cell [rows, columns]; NaN where nothing was mapped."""
     from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -137,7 +139,7 @@ def block_map(
     missing: Sequence[tuple[str, ArrayLike]] = (),
     names: Sequence[str] = (),
     unit: str = "m",
-    width_in: float = 7.2,
+    width_in: float = 5.6,
 ) -> Image:
     """Where the images were taken and what they cover, over the faded map.
 
@@ -185,7 +187,7 @@ def block_map(
     return _drawn(figure)
 
 
-def origin_map(seen: Surface, *, unit: str = "m", width_in: float = 7.2) -> Image | None:
+def origin_map(seen: Surface, *, unit: str = "m", width_in: float = 5.6) -> Image | None:
     """Measured (green) and predicted (orange) ground; None where the cloud does not tell."""
     if seen.predicted is None:
         return None
@@ -208,7 +210,7 @@ def _map_figure(grid: Grid, width_in: float) -> tuple[Figure, Axes]:
 
     x_min, x_max, y_min, y_max = grid.extent
     aspect = float(np.clip((y_max - y_min) / max(x_max - x_min, 1e-9), 0.35, 1.6))
-    figure = Figure(figsize=(width_in, width_in * 0.82 * aspect + 0.2), dpi=130, layout="constrained")
+    figure = Figure(figsize=(width_in, width_in * 0.82 * aspect + 0.2), dpi=165, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.set_aspect("equal")

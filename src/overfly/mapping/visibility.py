@@ -17,8 +17,6 @@ Image = NDArray[np.uint8]
 class View(Protocol):
     """A frame with its camera, as :class:`overfly.flights.Frame`."""
 
-    name: str
-
     @property
     def camera(self) -> Camera | None: ...
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -44,7 +45,8 @@ class Encoder(Part):
     - A 5 x 5 convolution of stride 2 comes first and a strided convolution block before each of the other three
       residual blocks (maps at 1/2, 1/4, 1/8, 1/16): residual blocks at full resolution cost twenty times as much.
     - *Key points and correspondences* come from a dense match map at half resolution, the sum of the block outputs
-      at 1/2, 1/4 and 1/8 through a convolution, normalised; see :mod:`overfly.networks.matching`.
+      at 1/2, 1/4 and 1/8, the coarser two through a convolution block, normalised
+      (see :mod:`overfly.networks.matching`).
     - *Max-pooling and fully connected*: the last map is max-pooled 2 x 2 and, positions kept, goes through one fully
       connected layer to the DFV.
     - *Image retrieval layer*: a fully connected layer from the DFV to a normalised global descriptor.
@@ -85,13 +87,9 @@ class Encoder(Part):
         self.size = (width, height)
         self.stem = ConvolutionBlock(inputs=3, outputs=widths[0], kernel=5, stride=2)
         self.blocks = nn.ModuleList(ResidualBlock(width=w) for w in widths)
-        self.downsampling = nn.ModuleList(
-            ConvolutionBlock(inputs=a, outputs=b, stride=2) for a, b in zip(widths[:-1], widths[1:], strict=True)
-        )
+        self.downsampling = nn.ModuleList(ConvolutionBlock(inputs=a, outputs=b, stride=2) for a, b in pairwise(widths))
         self.lateral = nn.ModuleList(nn.Conv2d(w, match_channels, 1) for w in widths[:3])
-        self.match_head = nn.Sequential(
-            nn.PReLU(match_channels), nn.Conv2d(match_channels, match_channels, 3, 1, 1, bias=False)
-        )
+        self.context = ConvolutionBlock(inputs=match_channels, outputs=match_channels)
         pooled = widths[3] * (width // 32) * (height // 32)
         self.feature_head = nn.Sequential(nn.Linear(pooled, features), nn.PReLU())
         self.retrieval_head = nn.Linear(features, descriptor)
@@ -111,18 +109,20 @@ class Encoder(Part):
                 f"{images.shape[-2]}: resize the images, or set image_size."
             )
         images = images.contiguous(memory_format=torch.channels_last)
-        maps = [self.blocks[0](self.stem((images - 0.5) * 4))]  # about unit variance
-        for down, block in zip(self.downsampling, list(self.blocks)[1:], strict=True):
-            maps.append(block(down(maps[-1])))
+        x = self.stem((images - 0.5) * 4)  # about unit variance
+        maps: list[Tensor] = []
+        for down, block in zip([nn.Identity(), *self.downsampling], self.blocks, strict=True):
+            x = block(down(x))
+            maps.append(x)
         pooled = F.max_pool2d(maps[3], 2).flatten(1)
         features = self.feature_head(pooled)
         return Encoded(self._match_map(maps), pooled, features, F.normalize(self.retrieval_head(features), dim=1))
 
     def _match_map(self, maps: list[Tensor]) -> Tensor:
         fine, middle, coarse = (layer(level) for layer, level in zip(self.lateral, maps[:3], strict=True))
-        summed = F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + middle
-        summed = F.interpolate(summed, scale_factor=2, mode="bilinear", align_corners=False) + fine
-        return F.normalize(self.match_head(summed), dim=1)
+        context = self.context(F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + middle)
+        context = F.interpolate(context, scale_factor=2, mode="bilinear", align_corners=False)
+        return F.normalize(context + fine, dim=1)
 
     def correction(self, pooled: Tensor, prior_from_window: Tensor) -> Tensor:
         """The geometric correction of each frame's prior pose relative to the reference frame.

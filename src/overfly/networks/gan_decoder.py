@@ -46,7 +46,8 @@ class GanDecoder(nn.Module):
         """What the encoder knows about the frames of a batch of windows.
 
         Args:
-            batch: ``images`` [B, K, 3, H, W] in 0..1; ``prior_from_window`` [B, K, 4, 4] for the correction, if at hand.
+            batch: ``images`` [B, K, 3, H, W] in 0..1; ``prior_from_window`` [B, K, 4, 4] for the
+                correction, if at hand.
 
         Returns:
             ``features`` [B, K, features], ``descriptor`` [B, K, D], ``match_map`` [B, K, C, H / 2, W / 2] and, with

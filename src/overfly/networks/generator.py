@@ -10,7 +10,7 @@ from overfly.networks.blocks import Part, ResidualBlock, UpsamplingBlock, grid_s
 from overfly.networks.encoder import Encoder
 
 POSE = 14
-"""Numbers that describe a frame's camera: its position, its rotation and its two focal lengths over the image's size."""
+"""Numbers that describe a frame's camera: position, rotation and the two focal lengths over the image's size."""
 
 
 class Generator(Part):
@@ -20,9 +20,9 @@ class Generator(Part):
 
     - *A sequence of frames*: every frame's DFV and camera pass a fully connected layer, the mean over the frames a
       second one; the result is the window's DFV. So any number of frames gives one cloud.
-    - *DFV concatenated to each point of the initial cloud*: one shared fully connected layer on [DFV, x, y, z]; the DFV's
-      share is computed once, which is the same. The paper says that the result has size 1024 x 1, which a DFV of 1024
-      and 3 coordinates cannot have.
+    - *DFV concatenated to each point of the initial cloud*: one shared fully connected layer on [DFV, x, y, z];
+      the DFV's share is computed once, which is the same. The paper says that the result has size 1024 x 1, which a
+      DFV of 1024 and 3 coordinates cannot have.
     - *Ten residual blocks identical to the encoder's*: the same class and width. The 1024 points of the initial cloud
       stand in a 32 x 32 grid, which makes them a feature map, so the encoder's two-dimensional weights fit as they are
       (:meth:`start_from`).
@@ -30,7 +30,8 @@ class Generator(Part):
       each followed by a fully connected layer over the 64 x 64 candidates and a max-pooling that lets the strongest
       candidate of each point's four through, so that 1024 points remain.
     - *Three FC + ReLU, then FC and max-pooling -> 1024 x 3*: shared over points; the last layer offers ``candidates``
-      moves per point and coordinate, of which the largest is taken. The moves start small and are added to the initial cloud.
+      moves per point and coordinate, of which the largest is taken. The moves start small and are added to the
+      initial cloud.
 
     Args:
         features: size of a frame's DFV.
@@ -115,7 +116,7 @@ class Generator(Part):
         Raises:
             InputError: no block of the encoder has the generator's width.
         """
-        fitting = {i: block for i, block in enumerate(encoder.blocks, 1) if block.width == self.width}  # type: ignore[union-attr]
+        fitting = {i: block for i, block in enumerate(encoder.blocks, 1) if block.width == self.width}
         if not fitting:
             widths = [block.width for block in encoder.blocks]
             raise InputError(

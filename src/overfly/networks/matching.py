@@ -111,7 +111,7 @@ def match(a: Tensor, b: Tensor, *, count: int = 512, mutual: bool = True, stride
     """
     cells, score = keypoints(a[None], count)
     cells = cells[0, torch.isfinite(score[0])]
-    pixels_a = cell_pixels(*a.shape[1:], stride, a.device)[cells]
+    pixels_a = cell_pixels(a.shape[1], a.shape[2], stride, a.device)[cells]
     pixels_b, similarity = nearest(a.flatten(1).T[cells][None], b[None], stride)
     keep = torch.ones(len(cells), dtype=torch.bool, device=a.device)
     if mutual and len(cells):

@@ -23,14 +23,15 @@ def inverse(rigid: Tensor) -> Tensor:
 
 
 def motion(rigid: Tensor) -> Tensor:
-    """Rotation vector (axis times angle, radians, below pi) and translation of rigid transforms [..., 4, 4] -> [..., 6]."""
+    """Rotation vector (axis times angle, radians, below pi) and translation of rigid [..., 4, 4] -> [..., 6]."""
     r = rigid[..., :3, :3]
     doubled = torch.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1)
     sine = doubled.norm(dim=-1) / 2
     cosine = (r.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     angle = torch.atan2(sine, cosine)
     small = sine < 1e-6
-    factor = torch.where(small, torch.full_like(sine, 0.5), angle / (2 * torch.where(small, torch.ones_like(sine), sine)))
+    safe = torch.where(small, torch.ones_like(sine), sine)
+    factor = torch.where(small, torch.full_like(sine, 0.5), angle / (2 * safe))
     return torch.cat([doubled * factor[..., None], rigid[..., :3, 3]], -1)
 
 

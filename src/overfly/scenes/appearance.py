@@ -29,8 +29,8 @@ class Appearance:
     sun_azimuth_deg: float = 150.0
     sun_elevation_deg: float = 50.0
     shadows: bool = True
-    sun: float = 0.8
-    sky: float = 0.32
+    sun: float = 1.1
+    sky: float = 0.40
     haze: float = 0.04
     exposure: float = 1.0
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)

@@ -63,11 +63,11 @@ class DeviceScene:
         g.road = put(np.zeros((1, 1, 4), np.float32) if cover is None else cover.road, wp.vec4)
         if cover is not None:
             turn = np.radians(cover.heading_deg)
-            g.x_min, g.y_min, g.cell = cover.x_min, cover.y_min, cover.cell
+            g.x_min, g.y_min, g.size = cover.x_min, cover.y_min, cover.size_m
             g.turn = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
             g.pavement, g.marked, g.wild = cover.pavement, int(cover.marked), cover.wild
         else:
-            g.cell, g.turn = 1.0, wp.vec2(1.0, 0.0)
+            g.size, g.turn = 1.0, wp.vec2(1.0, 0.0)
         s.ground = g
         s.seed = scene.seed * 7919 % 1000003
         return s

@@ -15,7 +15,7 @@ class GroundData:
     road: wp.array2d(dtype=wp.vec4)
     x_min: float
     y_min: float
-    cell: float
+    size: float
     turn: wp.vec2  # cos, sin of the layout's heading
     pavement: float  # width of the pavement beside a street, 0 = none
     marked: int  # whether streets carry lane marks
@@ -32,12 +32,22 @@ def pick(kind: int, at: int, weight: float) -> float:
 @wp.func
 def cover_at(x: float, y: float, data: GroundData) -> int:
     """The cover with the largest bilinear weight: cell borders become straight, not stairs."""
-    gx = (x - data.x_min) / data.cell - 0.5
-    gy = (y - data.y_min) / data.cell - 0.5
     rows = data.kind.shape[0]
     cols = data.kind.shape[1]
+    gx = (x - data.x_min) / data.size * float(cols) - 0.5
+    gy = (y - data.y_min) / data.size * float(rows) - 0.5
     if gx < -0.5 or gy < -0.5 or gx > float(cols) - 0.5 or gy > float(rows) - 0.5:
-        return data.wild
+        # Beyond the landscape: a patchwork, mostly of what the style is surrounded by.
+        odds = hash01(int(wp.floor((x + 0.4 * y) / 90.0)), int(wp.floor((y - 0.4 * x) / 70.0)), 5)
+        if odds < 0.5:
+            return data.wild
+        if odds < 0.62:
+            return 5
+        if odds < 0.72:
+            return 6
+        if odds < 0.86:
+            return 11
+        return 1
     i = wp.clamp(int(wp.floor(gx)), 0, cols - 2)
     j = wp.clamp(int(wp.floor(gy)), 0, rows - 2)
     a = int(data.kind[j, i])
@@ -71,10 +81,11 @@ def cover_at(x: float, y: float, data: GroundData) -> int:
 @wp.func
 def road_at(x: float, y: float, data: GroundData) -> wp.vec4:
     """Signed distance to the road's axis, half width, way along, distance to the next crossing."""
-    gx = (x - data.x_min) / data.cell - 0.5
-    gy = (y - data.y_min) / data.cell - 0.5
     rows = data.road.shape[0]
     cols = data.road.shape[1]
+    cell = data.size / float(cols)
+    gx = (x - data.x_min) / cell - 0.5
+    gy = (y - data.y_min) / cell - 0.5
     if rows < 2 or gx < -0.5 or gy < -0.5 or gx > float(cols) - 0.5 or gy > float(rows) - 0.5:
         return wp.vec4(1.0e4, 1.0, 0.0, 1.0e4)
     i = wp.clamp(int(wp.floor(gx)), 0, cols - 2)
@@ -94,7 +105,7 @@ def road_at(x: float, y: float, data: GroundData) -> wp.vec4:
         near = c
     if u > 0.5 and v > 0.5:
         near = d
-    if wp.abs(a[2] - d[2]) > 4.0 * data.cell or wp.abs(b[2] - c[2]) > 4.0 * data.cell:
+    if wp.abs(a[2] - d[2]) > 4.0 * cell or wp.abs(b[2] - c[2]) > 4.0 * cell:
         side = near[0]
         r = (wp.vec4(wp.abs(a[0]), 0.0, 0.0, a[3]) * (1.0 - u) + wp.vec4(wp.abs(b[0]), 0.0, 0.0, b[3]) * u) * (1.0 - v) + (
             wp.vec4(wp.abs(c[0]), 0.0, 0.0, c[3]) * (1.0 - u) + wp.vec4(wp.abs(d[0]), 0.0, 0.0, d[3]) * u
@@ -106,8 +117,8 @@ def road_at(x: float, y: float, data: GroundData) -> wp.vec4:
 @wp.func
 def asphalt(x: float, y: float, seed: int, foot: float) -> wp.vec3:
     broad = fractal(x, y, seed + 40, 23.0, 3, 0.5, foot)
-    grain = fractal(x, y, seed + 50, 0.9, 3, 0.7, foot)
-    shade = 0.125 * (1.0 + 0.10 * broad + 0.06 * grain)
+    grain = fractal(x, y, seed + 50, 2.1, 4, 0.75, foot)
+    shade = 0.125 * (1.0 + 0.10 * broad + 0.07 * grain)
     # Patches where the surface was opened and closed again.
     cx = wp.floor(x / 7.0)
     cy = wp.floor(y / 7.0)
@@ -124,11 +135,11 @@ def asphalt(x: float, y: float, seed: int, foot: float) -> wp.vec3:
 
 @wp.func
 def paving(x: float, y: float, seed: int, foot: float) -> wp.vec3:
-    weather = fractal(x, y, seed + 70, 8.0, 5, 0.6, foot)
+    weather = fractal(x, y, seed + 70, 8.0, 5, 0.75, foot)
     slab = hash01(int(wp.floor(x / 0.6)), int(wp.floor(y / 0.6)), seed + 71) - 0.5
     fine = wp.clamp(1.6 - 2.0 * foot / 0.6, 0.0, 1.0)
     joint = wp.max(band(x / 0.6, 0.0, 0.07, foot / 0.6), band(y / 0.6, 0.0, 0.07, foot / 0.6))
-    shade = (0.33 + 0.05 * weather + 0.12 * slab * fine) * (1.0 - 0.3 * joint)
+    shade = (0.33 + 0.055 * weather + 0.13 * slab * fine) * (1.0 - 0.3 * joint)
     return wp.vec3(shade * 1.03, shade, shade * 0.94)
 
 
@@ -145,12 +156,12 @@ def ground(x: float, y: float, seed: int, foot: float, data: GroundData) -> wp.v
             wear = wp.clamp(0.85 + 0.5 * fractal(x, y, seed + 80, 1.2, 2, 0.7, foot), 0.0, 1.0)
             white = wp.vec3(0.62, 0.62, 0.60)
             mark = line(away + 0.35, 0.07, foot)
-            if road[3] > road[1] + 5.0:
+            if road[3] > 5.0:
                 mark = wp.max(mark, line(road[0], 0.08, foot) * band(road[2] / 9.0, 0.0, 0.45, foot / 9.0))
             else:
-                if road[3] > road[1] + 1.5 and road[3] < road[1] + 4.2 and away < -0.6:
+                if road[3] > 1.2 and road[3] < 4.2 and away < -0.6:
                     mark = band(road[0] / 1.0, 0.0, 0.5, foot)
-                if road[3] <= road[1] + 0.8:
+                if road[3] <= 0.8:
                     mark = 0.0
             color = mix(color, white, mark * wear)
         else:
@@ -180,8 +191,8 @@ def ground(x: float, y: float, seed: int, foot: float, data: GroundData) -> wp.v
         swell = fractal(x, y, seed + 90, 30.0, 2, 0.5, foot)
         return wp.vec3(0.022, 0.04, 0.042) * (1.0 + 0.12 * swell)
 
-    broad = fractal(x, y, seed, 60.0, 4, 0.6, foot)
-    grain = fractal(x, y, seed + 20, 2.2, 5, 0.72, foot)
+    broad = fractal(x, y, seed, 60.0, 3, 0.6, foot)
+    grain = fractal(x, y, seed + 20, 3.1, 5, 0.75, foot)
     if kind == 4:
         return wp.vec3(0.30, 0.28, 0.25) * (1.0 + 0.06 * broad + 0.16 * grain)
     if kind == 12:
@@ -191,9 +202,12 @@ def ground(x: float, y: float, seed: int, foot: float, data: GroundData) -> wp.v
     if kind == 7:
         color = wp.vec3(0.075, 0.075, 0.035) * (1.0 + 0.2 * broad)
         return mix(color * (1.0 + 0.35 * grain), wp.vec3(0.10, 0.07, 0.04), wp.clamp(0.35 + 0.4 * grain, 0.0, 1.0))
-    if kind == 5 or kind == 6:
+    if kind == 5 or kind == 6 or kind == 13:
         green = wp.vec3(0.085, 0.135, 0.035)
         pitch = 1.5
+        if kind == 13:
+            green = wp.vec3(0.30, 0.24, 0.10)
+            pitch = 3.1
         if kind == 6:
             green = wp.vec3(0.20, 0.145, 0.095)
             pitch = 2.8
@@ -208,4 +222,4 @@ def ground(x: float, y: float, seed: int, foot: float, data: GroundData) -> wp.v
         color = mix(wp.vec3(0.09, 0.14, 0.045), wp.vec3(0.17, 0.14, 0.08), wp.clamp(spots * 0.9 - 0.1, 0.0, 1.0))
         return mix(color, wp.vec3(0.04, 0.07, 0.025), wp.clamp(-spots * 1.2 - 0.2, 0.0, 1.0)) * (1.0 + 0.10 * grain)
     dry = wp.clamp(0.5 + 0.45 * broad, 0.0, 1.0)  # meadow: broad and faint, honestly hard to match
-    return mix(wp.vec3(0.085, 0.135, 0.04), wp.vec3(0.14, 0.15, 0.06), dry) * (1.0 + 0.045 * grain)
+    return mix(wp.vec3(0.085, 0.135, 0.04), wp.vec3(0.14, 0.15, 0.06), dry) * (1.0 + 0.085 * grain)

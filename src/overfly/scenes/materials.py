@@ -44,3 +44,4 @@ PARKING = 9
 DIRT = 10
 GARDEN = 11
 TRACK = 12  # railway ballast
+RIPE = 13  # ripe cereal

@@ -189,7 +189,7 @@ class Renderer:
         light.sun = wp.vec3(*sun)
         light.sun_strength = appearance.sun
         light.sky_strength = appearance.sky
-        light.haze = appearance.haze
+        light.haze = float(-np.log(1.0 - appearance.haze)) / 1000.0
         light.exposure = appearance.exposure
         light.gain = wp.vec3(*appearance.gain)
         light.vignetting = appearance.vignetting

@@ -59,10 +59,10 @@ class Cover:
     """What lies on the ground: a raster that the shading kernel reads; row 0 is the south.
 
     Attributes:
-        x_min, y_min, cell: the outer corner of the first cell and the cell's size, metres.
-        kind: [rows, cols] uint8, codes of :mod:`overfly.scenes.materials`.
-        road: [rows, cols, 4] float32: signed distance to the nearest road's axis, half its width, the way along it,
-            and the distance to the nearest crossing; all metres. Bilinear interpolation keeps its edges sharp.
+        x_min, y_min, size_m: the south-western corner and the width of the square that both rasters fill, metres.
+        kind: [n, n] uint8, codes of :mod:`overfly.scenes.materials`.
+        road: [k, k, 4] float32: signed distance to the nearest road's axis, half its width, the way along it,
+            and the way to the edge of the nearest crossing; all metres. Bilinear interpolation keeps its edges sharp.
         heading_deg: turn of the layout against east, counter-clockwise: stall lines, mowing and paving follow it.
         pavement: width of the pavement beside the streets, metres, 0 = none.
         marked: whether the streets carry lane marks.
@@ -71,7 +71,7 @@ class Cover:
 
     x_min: float
     y_min: float
-    cell: float
+    size_m: float
     kind: NDArray[np.uint8]
     road: NDArray[np.float32]
     heading_deg: float = 0.0

@@ -34,7 +34,7 @@ class Light:
     sun: wp.vec3
     sun_strength: float
     sky_strength: float
-    haze: float
+    haze: float  # per metre
     exposure: float
     gain: wp.vec3
     vignetting: float
@@ -194,7 +194,7 @@ def shade_ray(
     ambient = light.sky_strength * (0.62 + 0.38 * n[2])
     warm = wp.vec3(1.03, 1.0, 0.94) * direct + wp.vec3(0.90, 0.98, 1.12) * ambient
     color = wp.cw_mul(color, warm)
-    air = 1.0 - wp.exp(wp.log(1.0 - light.haze) * far * 0.001)
+    air = 1.0 - wp.exp(-light.haze * far)
     return mix(color, wp.vec3(0.55, 0.62, 0.70), air)
 
 

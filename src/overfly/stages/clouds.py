@@ -28,10 +28,10 @@ def window_metrics(points: ArrayLike, reference: ArrayLike, scale: float) -> dic
     Returns:
         - ``chamfer_sum_1024``: the paper's Eq. 2 in window units, for 1024 points in each cloud;
         - ``chamfer_m2``, ``chamfer_m``: mean squared and mean distance in metres, both directions added;
-        - ``height_error_m``: mean absolute difference between the height of a reference point and that of the predicted
-          point nearest to it in x and y;
-        - ``precision_2pct``, ``recall_2pct``, ``near_2pct``, ``fscore_2pct``: shares of predicted points within 2 % of the
-          footprint's width of the reference, the reverse, their mean (design: the full network's accuracy), F-score.
+        - ``height_error_m``: mean absolute difference between the height of a reference point and that of the
+          predicted point nearest to it in x and y;
+        - ``precision_2pct``, ``recall_2pct``, ``near_2pct``, ``fscore_2pct``: shares of predicted points within 2 % of
+          the footprint's width of the reference, the reverse, their mean (design: the full network's accuracy), F-score.
 
     Raises:
         InputError: a cloud is empty or not finite.

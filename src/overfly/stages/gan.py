@@ -108,8 +108,8 @@ class GanStage(Stage):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         self._evaluate(batch, batch_idx, "val")
 
-    def test_step(self, batch: Batch, batch_idx: int) -> None:
-        self._evaluate(batch, batch_idx, "test")
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+        self._evaluate(batch, batch_idx, self.test_split(dataloader_idx))
 
     def _discriminator_step(self, optimizer: Any, cloud: Tensor, real: Tensor, batch_idx: int) -> tuple[Tensor, Tensor]:
         with self.toggled_optimizer(optimizer):
@@ -122,7 +122,9 @@ class GanStage(Stage):
         if "chamfer" in self.weights:
             terms["chamfer"] = losses.chamfer(cloud, real)
         if "emd" in self.weights:
-            chosen = [torch.randperm(x.shape[1], generator=random)[: self.emd_points].to(x.device) for x in (cloud, real)]
+            chosen = [
+                torch.randperm(x.shape[1], generator=random)[: self.emd_points].to(x.device) for x in (cloud, real)
+            ]
             terms["emd"] = losses.emd(cloud[:, chosen[0]], real[:, chosen[1]])
         if self._adversarial():
             logits = self._logits(cloud)

@@ -13,6 +13,7 @@ class RetrievalTop1(Metric):
 
     The gallery of a frame is its own window and all windows of other scenes; other windows of its own scene are left
     out, since how much they overlap it is unknown. Frames that overlap no other are not asked. NaN before any was.
+    A negative overlap marks the same frame, which is no candidate.
     """
 
     full_state_update = False
@@ -39,9 +40,10 @@ class RetrievalTop1(Metric):
         n, k = descriptors.shape[:2]
         gallery, frame_scene = descriptors.flatten(0, 1), scenes.repeat_interleave(k)
         window = torch.arange(n, device=scenes.device).repeat_interleave(k)
-        itself = torch.eye(k, dtype=torch.bool, device=scenes.device)
+        diagonal = torch.eye(k, dtype=torch.bool, device=scenes.device)
         hits = asked = 0
         for w in range(n):  # a window at a time: the whole matrix would grow with the square of the split
+            itself = diagonal | (overlaps[w] < 0)
             likeness = descriptors[w] @ gallery.T  # [K, n K]
             likeness[:, (frame_scene == scenes[w]) & (window != w)] = -torch.inf
             likeness[:, w * k : (w + 1) * k].masked_fill_(itself, -torch.inf)

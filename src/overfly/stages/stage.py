@@ -23,6 +23,9 @@ OptimizerFactory = Callable[..., torch.optim.Optimizer]
 TERMS = ("chamfer", "emd", "adversarial", "adversarial_eq1", "correspondence", "retrieval", "correction")
 """The weights of conf/loss; each is named like its function in :mod:`overfly.losses`."""
 
+TEST_SPLITS = ("test", "unseen")
+"""Scenes of the styles that were trained on, and of other styles."""
+
 PARTS = ("encoder", "generator", "discriminator")
 
 
@@ -57,8 +60,8 @@ class Stage(L.LightningModule):
         self.weights = {name: float(loss[name]) for name in self.terms if loss.get(name)}
         if not self.weights:
             raise InputError(
-                f"{type(self).__name__} has nothing to minimise: of {', '.join(self.terms)} at least one needs a weight "
-                "above 0 in the loss, for instance loss=paper."
+                f"{type(self).__name__} has nothing to minimise: of {', '.join(self.terms)} at least one needs a "
+                "weight above 0 in the loss, for instance loss=paper."
             )
         self.automatic_optimization = False
         self.network = network
@@ -106,8 +109,15 @@ class Stage(L.LightningModule):
         """Log values as ``<split>/<name>``: their mean over the epoch, each batch weighing ``count``."""
         if count:
             named = {f"{split}/{name}": value for name, value in values.items()}
-            shown = split != "test"
-            self.log_dict(named, on_step=False, on_epoch=True, batch_size=count, sync_dist=True, prog_bar=shown)
+            self.log_dict(
+                named, on_step=False, on_epoch=True, batch_size=count, sync_dist=True, add_dataloader_idx=False
+            )
+
+    def test_split(self, dataloader_idx: int) -> str:
+        """The name of a test split, by which its metrics are logged: ``test``, then ``unseen``."""
+        datamodule = getattr(self.trainer, "datamodule", None)
+        names: list[str] = getattr(datamodule, "test_splits", list(TEST_SPLITS))
+        return names[dataloader_idx]
 
     def warm_start(self, state: Mapping[str, Tensor], source: str) -> list[str]:
         """Start from the weights of another run.

@@ -18,7 +18,12 @@ RIGHT_PX = 2.0
 
 
 def encoder_terms(
-    output: Mapping[str, Tensor], batch: Mapping[str, Tensor], names: Iterable[str], *, pixels: int, random: torch.Generator
+    output: Mapping[str, Tensor],
+    batch: Mapping[str, Tensor],
+    names: Iterable[str],
+    *,
+    pixels: int,
+    random: torch.Generator,
 ) -> dict[str, Tensor]:
     """The encoder's loss terms, means over what can be judged.
 
@@ -52,12 +57,18 @@ def overlapping(batch: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
 
     Windows of one scene may overlap each other by an unknown amount: such pairs are neither.
     """
-    overlaps, scene = batch["overlaps"], batch["scene"]
-    b, k = overlaps.shape[:2]
-    positive = torch.block_diag(*(overlaps > 0).to(torch.uint8)).bool()
-    positive &= ~torch.eye(b * k, dtype=torch.bool, device=positive.device)
-    frame_scene = scene.repeat_interleave(k)
-    return positive, frame_scene[:, None] != frame_scene[None]
+    common = (batch["overlaps"] > 0) & ~repeated(batch)
+    frame_scene = batch["scene"].repeat_interleave(common.shape[1])
+    return torch.block_diag(*common.to(torch.uint8)).bool(), frame_scene[:, None] != frame_scene[None]
+
+
+def repeated(batch: Mapping[str, Tensor]) -> Tensor:
+    """Which pairs of a window's frames are the same image [B, K, K]; the diagonal is.
+
+    A window repeats a frame where the flight has too few neighbours: matching an image with itself teaches nothing.
+    """
+    poses = batch["camera_from_window"].flatten(2)
+    return (poses[:, :, None] - poses[:, None]).abs().amax(-1) < 1e-6
 
 
 def matching_counts(match_map: Tensor, batch: Mapping[str, Tensor], count: int) -> tuple[int, int]:
@@ -74,6 +85,7 @@ def matching_counts(match_map: Tensor, batch: Mapping[str, Tensor], count: int) 
     b, k, _, h, w = match_map.shape
     places = cell_pixels(h, w, MATCH_STRIDE, match_map.device)
     cells, score = (x.unflatten(0, (b, k)) for x in keypoints(match_map.flatten(0, 1), count))
+    same = repeated(batch)
     right = visible = 0
     for i in range(k):
         pixels = places[cells[:, i]]  # [B, M, 2]
@@ -82,7 +94,7 @@ def matching_counts(match_map: Tensor, batch: Mapping[str, Tensor], count: int) 
         for j in range(k):
             if i != j:
                 true, seen = true_correspondences(pixels, *_views(batch, i), *_views(batch, j))
-                seen = seen & torch.isfinite(score[:, i])
+                seen = seen & torch.isfinite(score[:, i]) & ~same[:, i, j, None]
                 found, _ = nearest(queries, match_map[:, j])
                 right += int((seen & ((found - true).norm(dim=-1) <= RIGHT_PX)).sum())
                 visible += int(seen.sum())
@@ -90,7 +102,7 @@ def matching_counts(match_map: Tensor, batch: Mapping[str, Tensor], count: int) 
 
 
 def correction_errors(output: Mapping[str, Tensor], batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Mean errors of the relative poses before (``prior_``) and after (``corrected_``) the correction, degrees and metres."""
+    """Mean errors of the relative poses before (``prior_``) and after (``corrected_``) the correction."""
     true = relative(batch["camera_from_window"])[:, 1:]
     prior = relative(batch["prior_from_window"])[:, 1:]
     metres = batch["scale"][:, None]
@@ -106,6 +118,7 @@ def correction_errors(output: Mapping[str, Tensor], batch: Mapping[str, Tensor])
 def _correspondence(match_map: Tensor, batch: Mapping[str, Tensor], count: int, random: torch.Generator) -> Tensor:
     b, k, _, h, w = match_map.shape
     places = cell_pixels(h, w, MATCH_STRIDE, match_map.device).expand(b, -1, -1)
+    same = repeated(batch)
     values, judged = [], []
     for i in range(k):
         for j in range(i + 1, k):
@@ -117,7 +130,7 @@ def _correspondence(match_map: Tensor, batch: Mapping[str, Tensor], count: int, 
             queries = queries.gather(1, chosen[..., None].expand(-1, -1, queries.shape[2]))
             at = true.gather(1, chosen[..., None].expand(-1, -1, 2)) / MATCH_STRIDE
             values.append(losses.correspondence(queries, match_map[:, second], at))
-            judged.append(visible.gather(1, chosen))
+            judged.append(visible.gather(1, chosen) & ~same[:, i, j, None])
     if not values:
         return match_map.sum() * 0
     return _mean(torch.stack(values), torch.stack(judged))

@@ -1,0 +1,318 @@
+"""Fly over a scene: plan, render and write a whole flight folder; the body of ``overfly fly``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from overfly.cloud import write_cloud
+from overfly.errors import InputError
+from overfly.files import replacing
+from overfly.flights.cameras import CameraPreset, find_preset
+from overfly.flights.flight import Frame
+from overfly.flights.images import defect
+from overfly.flights.noise import PoseNoise, noise_model
+from overfly.flights.plan import ALTITUDE_RANGE, DEFAULT_TILT_DEG, OVERLAP_RANGE, PATHS, Plan, check_number, plan_flight
+from overfly.flights.reference import reference_cloud
+from overfly.flights.site import Area, Site
+from overfly.flights.transforms import write_transforms
+from overfly.flights.write import Stamp, frame_name, remove_leftovers, stamped_frame, write_frame
+from overfly.geometry import Array, Camera, Origin, gimbal_from_rotation
+
+if TYPE_CHECKING:
+    from overfly.scenes import Appearance, Scene
+
+DEFAULT_ORIGIN = Origin(46.0, 8.0, 450.0)
+DEFAULT_STRIPS = 5
+SCENE_SIZE_M = (200.0, 4000.0)
+RECORD = "fly.json"
+
+
+def default_area(
+    flight_path: str, camera: Camera, altitude: float, overlap: float, side_overlap: float, tilt_deg: float
+) -> tuple[float, float]:
+    """Width and depth in metres of ground for about 5 x 5 frames, or for one orbit."""
+    level = Site(camera, lambda xy: np.zeros(len(xy)), (-1, -1, 1, 1), altitude, tilt_deg, False)
+    length, width, _ = level.frame_size(tilt_deg)
+    if flight_path == "circular":
+        side = altitude * math.tan(math.radians(tilt_deg)) + length / 2
+        return side, side
+    steps = DEFAULT_STRIPS - 1
+    east, north = width * (1 + steps * (1 - side_overlap / 100)), length * (1 + steps * (1 - overlap / 100))
+    return (max(east, north),) * 2 if flight_path == "double_grid" else (east, north)
+
+
+def fly(
+    scene: Scene | Path | str,
+    *,
+    out: Path | str,
+    flight_path: str = "grid",
+    overlap: float = 50.0,
+    side_overlap: float | None = None,
+    altitude: float = 150.0,
+    camera: str | Camera = "p4p",
+    width: int | None = None,
+    height: int | None = None,
+    area_m: float | None = None,
+    frames: int | None = None,
+    tilt_deg: float | None = None,
+    heading_deg: float = 0.0,
+    terrain_follow: bool = False,
+    seed: int = 0,
+    noise: str | PoseNoise = "none",
+    appearance: Appearance | None = None,
+    origin: Origin | None = None,
+    supersample: int = 2,
+    reference_points: int = 500_000,
+    processes: int = 1,
+    quality: int = 95,
+) -> tuple[Plan, list[Frame]]:
+    """Render a flight folder. Frames that an earlier, interrupted call of the same flight finished are kept.
+
+    Args:
+        scene: a scene, a style's name (built large enough for the flight) or a scene file.
+        out: the folder; it must not hold another flight.
+        flight_path, overlap, altitude, frames, tilt_deg, heading_deg, terrain_follow: see :func:`plan_flight`.
+        side_overlap: percent; None takes ``overlap``.
+        camera: a preset's name (800 pixels wide unless ``width`` or ``height`` is given), or a camera.
+        area_m: side of the square to cover, in the scene's middle; None takes about 5 x 5 frames, or one orbit.
+        seed: of the scene's style, the random path, and all noise.
+        noise: of the GPS and gimbal values in the images' metadata; transforms.json always holds the true cameras.
+        origin: where the local frame stands; None takes the scene's own, else 46 N 8 E.
+        reference_points: size of reference.laz, 0 for none.
+        processes: that render.
+
+    Returns:
+        The plan, whose ``summary()`` states the measured overlap, and the frames.
+
+    Raises:
+        InputError: a bad value, or ``out`` holds something else.
+    """
+    from overfly.scenes import open_scene
+
+    out = Path(out)
+    side = overlap if side_overlap is None else side_overlap
+    preset = find_preset(camera) if isinstance(camera, str) else None
+    if preset is None:
+        pinhole = camera
+    else:
+        pinhole = preset.camera(800, None) if width is None and height is None else preset.camera(width, height)
+    assert isinstance(pinhole, Camera)
+    _check(flight_path, altitude, overlap, side, seed, processes)
+    model = noise_model(noise)
+    tilt = DEFAULT_TILT_DEG[flight_path] if tilt_deg is None else check_number("tilt_deg", tilt_deg, 0, 60, "degrees")
+    if area_m is None:
+        extent = default_area(flight_path, pinhole, altitude, overlap, side, tilt)
+    else:
+        extent = (check_number("area_m", area_m, 1, 100_000, "metres"),) * 2
+    if isinstance(scene, str | Path):
+        # The landscape must reach under every footprint; its rim is a tenth wider than the flight.
+        reach = altitude * math.tan(math.radians(min(tilt + pinhole.fov_deg[1] / 2, 75))) if tilt else 0.0
+        needed = 1.1 * (max(extent) + (reach if flight_path == "circular" else 0.2 * reach))
+        scene = open_scene(scene, seed, size_m=float(np.clip(math.ceil(needed / 50) * 50, *SCENE_SIZE_M)))
+    x0, y0, x1, y1 = scene.extent
+    cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
+    area: Area = (cx - extent[0] / 2, cy - extent[1] / 2, cx + extent[0] / 2, cy + extent[1] / 2)
+    plan = plan_flight(
+        flight_path,
+        area,
+        altitude=altitude,
+        overlap=overlap,
+        side_overlap=side,
+        camera=pinhole,
+        ground=scene.ground,
+        rng=np.random.default_rng([seed, 1]),
+        tilt_deg=tilt_deg,
+        heading_deg=heading_deg,
+        frames=frames,
+        terrain_follow=terrain_follow,
+    )
+    origin = origin or scene.origin or DEFAULT_ORIGIN
+    facts = {
+        "altitude": plan.altitude,
+        "overlap": plan.overlap,
+        "side_overlap": plan.side_overlap,
+        "flight_path": plan.flight_path,
+        "measured_overlap": plan.measured_overlap,
+        "measured_side_overlap": plan.measured_side_overlap,
+        "scene": scene.name,
+        "seed": seed,
+        "camera": preset.name if preset is not None else "custom",
+        "ground_height": plan.ground_height,
+        "noise": asdict(model),
+    }
+    settings = [supersample, quality, reference_points, repr(appearance), asdict(origin)]
+    _claim(out, _key(scene, plan, facts, settings))
+    stamps = _stamps(plan, origin, model, preset, seed)
+    _render(scene, plan, stamps, out, appearance, supersample, quality, seed, processes)
+    written = [
+        stamped_frame(out / "images" / frame_name(i), plan.camera, pose, stamp, i)
+        for i, (pose, stamp) in enumerate(zip(plan.world_from_camera, stamps, strict=True))
+    ]
+    if reference_points and not (out / "reference.laz").is_file():
+        _write_reference(scene, plan, out, reference_points, seed)
+    write_transforms(out / "transforms.json", written, origin, facts)
+    return plan, written
+
+
+def _check(flight_path: str, altitude: float, overlap: float, side: float, seed: int, processes: int) -> None:
+    """What the area and the scene are computed from; the plan checks the rest."""
+    from overfly.errors import unknown
+
+    if flight_path not in PATHS:
+        raise unknown("The flight path", flight_path, PATHS)
+    check_number("altitude", altitude, *ALTITUDE_RANGE, "metres over ground")
+    check_number("overlap", overlap, *OVERLAP_RANGE, "percent")
+    check_number("side_overlap", side, *OVERLAP_RANGE, "percent")
+    for name, value, least in (("seed", seed, 0), ("processes", processes, 1)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise InputError(f"{name}={value!r} is not allowed: give a whole number, at least {least}.")
+
+
+def _key(scene: Scene, plan: Plan, facts: dict[str, Any], settings: list[Any]) -> str:
+    """A digest of everything that decides the folder's content."""
+    digest = hashlib.sha256()
+    for array in (scene.vertices, scene.faces, plan.world_from_camera):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(json.dumps([facts, settings, plan.camera.to_dict()], sort_keys=True, default=str).encode())
+    return digest.hexdigest()
+
+
+def _claim(out: Path, key: str) -> None:
+    """Make ``out`` this flight's folder, or find that it already is.
+
+    Raises:
+        InputError: it holds something else.
+    """
+    record = out / RECORD
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file: give a folder for the flight.")
+    if record.is_file():
+        try:
+            old = json.loads(record.read_text(encoding="utf-8")).get("key")
+        except (ValueError, AttributeError):
+            old = None
+        if old == key:
+            return
+        raise InputError(f"{out} holds another flight: give another folder, or delete this one first.")
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty and holds no flight of this command: give another folder.")
+    with replacing(record) as temporary:
+        temporary.write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
+
+
+def _stamps(plan: Plan, origin: Origin, model: PoseNoise, preset: CameraPreset | None, seed: int) -> list[Stamp]:
+    rng = np.random.default_rng([seed, 2])
+    poses = plan.world_from_camera
+    positions = model.positions(poses[:, :3, 3], rng)
+    angles = model.angles([gimbal_from_rotation(p[:3, :3]) for p in poses], rng)
+    names = {"make": preset.make, "model": preset.model} if preset is not None else {}
+    focal = preset.focal_mm if preset is not None else None
+    return [
+        Stamp(position, (yaw, pitch, roll), plan.ground_height, origin, focal_mm=focal, **names)
+        for position, (yaw, pitch, roll) in zip(positions, angles.tolist(), strict=True)
+    ]
+
+
+_WORKER: dict[str, Any] = {}
+
+
+def _start_worker(scene: Scene) -> None:
+    from overfly.scenes import Renderer
+
+    _WORKER["renderer"] = Renderer(scene)
+
+
+def _shoot(
+    path: Path, camera: Camera, pose: Array, stamp: Stamp, index: int, look: Appearance | None, options: tuple
+) -> int:
+    supersample, quality, seed = options
+    rng = np.random.default_rng([seed, 3, index])
+    renderer = _WORKER["renderer"]
+    rendered = renderer.render(camera, pose, supersample=supersample, appearance=look, rng=rng)
+    write_frame(path, rendered.image, camera, pose, stamp, index, quality=quality)
+    return index
+
+
+def _render(
+    scene: Scene,
+    plan: Plan,
+    stamps: list[Stamp],
+    out: Path,
+    look: Appearance | None,
+    supersample: int,
+    quality: int,
+    seed: int,
+    processes: int,
+) -> None:
+    """Render the frames that are not there yet."""
+    folder = out / "images"
+    folder.mkdir(exist_ok=True)
+    remove_leftovers(folder)
+    paths = [folder / frame_name(i) for i in range(len(plan))]
+    todo = [i for i, path in enumerate(paths) if not path.is_file() or defect(path) is not None]
+    options = (supersample, quality, seed)
+    jobs = [(paths[i], plan.camera, plan.world_from_camera[i], stamps[i], i, look, options) for i in todo]
+    with _progress("Rendering frames", len(plan), len(plan) - len(todo)) as advance:
+        if processes == 1 or len(jobs) < 2:
+            if jobs:
+                _start_worker(scene)
+            for job in jobs:
+                _shoot(*job)
+                advance()
+            _WORKER.clear()
+            return
+        context = get_context("spawn")
+        with ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker, initargs=(scene,)) as pool:
+            for _ in pool.map(_shoot, *zip(*jobs, strict=True), chunksize=1):
+                advance()
+
+
+def _write_reference(scene: Scene, plan: Plan, out: Path, n: int, seed: int) -> None:
+    from overfly.scenes import Renderer
+
+    site = Site(plan.camera, scene.ground, plan.area, plan.altitude, plan.tilt_deg, False)
+    outlines = site.outlines(plan.world_from_camera).reshape(-1, 2)
+    (x0, y0), (x1, y1) = outlines.min(0).tolist(), outlines.max(0).tolist()
+    renderer = Renderer(scene)
+    with _progress("Reference cloud", len(plan), 0) as advance:
+
+        def counted(poses: Iterable) -> Iterator:
+            for pose in poses:
+                yield pose
+                advance()
+
+        cloud = reference_cloud(
+            scene,
+            plan.camera,
+            plan.world_from_camera,
+            lambda pose: renderer.depth(plan.camera, pose),
+            (x0, y0, x1, y1),
+            n,
+            np.random.default_rng([seed, 4]),
+            counted,
+        )
+    write_cloud(cloud, out / "reference.laz")
+
+
+@contextmanager
+def _progress(what: str, total: int, done: int) -> Iterator[Any]:
+    """A bar on stderr; the value is the function that advances it by one."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(file=sys.stderr), transient=False) as bar:
+        task = bar.add_task(what, total=total, completed=done)
+        yield lambda: bar.advance(task)

@@ -1,0 +1,165 @@
+"""The block: the frames of a flight whose cameras are known, in one frame of reference, and how well they fit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.cloud import Cloud
+from overfly.errors import InputError
+from overfly.flights import Flight, Frame
+from overfly.geometry import Array, Camera, Origin, enu_from_geodetic
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Cameras of one flight.
+
+    Attributes:
+        frames: the registered frames, each with camera and pose, in the order of the flight.
+        origin: where the local frame stands on the Earth, None if unknown.
+        cameras_from: "estimated", or the file they were read from.
+        metric: whether lengths are metres.
+        reprojection_px: mean reprojection error, None if unknown.
+        points: sparse surface points [M, 3] in the block's frame, or None.
+        warnings: sentences for the user.
+    """
+
+    frames: list[Frame]
+    origin: Origin | None
+    cameras_from: str
+    metric: bool
+    reprojection_px: float | None = None
+    points: Array | None = None
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        return [frame.camera for frame in self.frames if frame.camera is not None]
+
+    @property
+    def poses(self) -> Array:
+        """world_from_camera [n, 4, 4]."""
+        return np.stack([f.world_from_camera for f in self.frames if f.world_from_camera is not None])
+
+    @property
+    def names(self) -> list[str]:
+        return [frame.name for frame in self.frames]
+
+    def gps_positions(self, frames: Sequence[Frame] | None = None) -> dict[str, Array]:
+        """Local positions [3] by the frames' own GPS; height NaN where GPS has none. Empty without an origin."""
+        found: dict[str, Array] = {}
+        for frame in self.frames if frames is None else frames:
+            if self.origin is not None and (gps := frame.gps) is not None:
+                height = self.origin.height if gps.altitude is None else gps.altitude
+                found[frame.name] = enu_from_geodetic([[gps.latitude, gps.longitude, height]], self.origin)[0]
+                if gps.altitude is None:
+                    found[frame.name][2] = np.nan
+        return found
+
+    def gps_rms(self) -> dict[str, float | None] | None:
+        """RMS distance of the cameras from their own GPS, a constant shift in height taken out; None without GPS."""
+        told = self.gps_positions()
+        if not told:
+            return None
+        positions = dict(zip(self.names, self.poses[:, :3, 3], strict=True))
+        away = np.array([positions[name] - told[name] for name in told])
+        rises = away[np.isfinite(away[:, 2]), 2]
+        vertical = float(np.sqrt(np.mean((rises - np.median(rises)) ** 2))) if len(rises) else None
+        return {
+            "horizontal_m": round(float(np.sqrt((away[:, :2] ** 2).sum(1).mean())), 3),
+            "vertical_m": None if vertical is None else round(vertical, 3),
+        }
+
+
+def given_block(flight: Flight) -> Block:
+    """The cameras that the flight folder holds.
+
+    Raises:
+        InputError: it holds none, or for fewer than two frames.
+    """
+    if flight.cameras_from is None:
+        raise InputError(
+            f"{flight.root} holds no cameras (transforms.json, sparse/0 or reconstruction.json): "
+            "map it with --cameras estimate."
+        )
+    frames = [f for f in flight.frames if f.camera is not None and f.world_from_camera is not None]
+    # A COLMAP model without an origin has a scale of its own; transforms.json is in metres by definition.
+    metric = flight.origin is not None or flight.cameras_from == "transforms.json"
+    metric = metric and flight.facts.get("scale") != "unknown"  # as our own transforms.json says of such blocks
+    return checked(Block(frames, flight.origin, flight.cameras_from, metric), flight)
+
+
+def checked(block: Block, flight: Flight) -> Block:
+    """The block, if a map can be made from it."""
+    if len(block.frames) < 2:
+        which = f" ({block.frames[0].name})" if block.frames else ""
+        raise InputError(
+            f"{len(block.frames)} of {len(flight)} images{which} could be placed, and a map needs at least two: "
+            "check that neighbouring images show the same ground (30 % overlap at the least) and are sharp."
+        )
+    return block
+
+
+def write_block(block: Block, folder: Path) -> None:
+    """Keep a block in a folder."""
+    content = {
+        "frames": {
+            frame.name: {"camera": camera.to_dict(), "world_from_camera": pose.tolist()}
+            for frame, camera, pose in zip(block.frames, block.cameras, block.poses, strict=True)
+        },
+        "origin": None if block.origin is None else asdict(block.origin),
+        "cameras_from": block.cameras_from,
+        "metric": block.metric,
+        "reprojection_px": block.reprojection_px,
+        "warnings": block.warnings,
+    }
+    (folder / "block.json").write_text(json.dumps(content))
+    if block.points is not None:
+        np.save(folder / "points.npy", block.points)
+
+
+def read_block(folder: Path, flight: Flight) -> Block:
+    """The block that :func:`write_block` kept of this flight."""
+    content: dict[str, Any] = json.loads((folder / "block.json").read_text())
+    known = content["frames"]
+    frames = [
+        replace(
+            frame,
+            camera=Camera(**known[frame.name]["camera"]),
+            world_from_camera=np.array(known[frame.name]["world_from_camera"]),
+        )
+        for frame in flight.frames
+        if frame.name in known
+    ]
+    points = folder / "points.npy"
+    return Block(
+        frames,
+        None if content["origin"] is None else Origin(**content["origin"]),
+        content["cameras_from"],
+        content["metric"],
+        content["reprojection_px"],
+        np.load(points) if points.is_file() else None,
+        content["warnings"],
+    )
+
+
+ATTRIBUTES = ("points", "colors", "confidence", "sigma_m", "views", "predicted")
+
+
+def keep_cloud(cloud: Cloud, folder: Path) -> None:
+    """Keep a cloud in a folder, exactly."""
+    arrays: dict[str, NDArray] = {n: getattr(cloud, n) for n in ATTRIBUTES if getattr(cloud, n) is not None}
+    np.savez(folder / "cloud.npz", **arrays)  # type: ignore[arg-type]
+
+
+def kept_cloud(folder: Path) -> Cloud:
+    """The cloud that :func:`keep_cloud` kept."""
+    with np.load(folder / "cloud.npz") as arrays:
+        return Cloud(**{name: arrays[name] for name in arrays.files})

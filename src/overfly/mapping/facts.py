@@ -1,0 +1,57 @@
+"""The numbers of a map, for ``map.json`` and its report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.cloud import Cloud
+from overfly.data.footprints import sees
+from overfly.geometry import Array, Camera, project
+from overfly.mapping.raster import Surface
+
+
+def ground_sampling(cloud: Cloud, cameras: Sequence[Camera], poses: Array) -> float:
+    """Median over the frames of depth / focal length: metres (or units) per pixel on what they see."""
+    sample = cloud.points[:: max(1, len(cloud) // 4000)]
+    found = []
+    for camera, pose in zip(cameras, poses, strict=True):
+        inside = sample[sees(sample, camera, pose)]
+        if len(inside):
+            found.append(float(np.median(project(inside, camera, pose)[1])) / camera.fx)
+    return float(np.median(found)) if found else float("nan")
+
+
+def cloud_facts(cloud: Cloud, seen: Surface, gsd: float) -> dict[str, Any]:
+    """Points, measured, predicted, area, density, height range, median sigma; lengths in the cloud's unit."""
+    predicted = 0 if cloud.predicted is None else int(cloud.predicted.sum())
+    area = float(np.count_nonzero(seen.filled)) * seen.grid.cell**2
+    low, high = np.percentile(cloud.points[:, 2], [1, 99])
+    return {
+        "points": len(cloud),
+        "measured": len(cloud) - predicted,
+        "predicted": predicted,
+        "area": round(area, 4),
+        "points_per_area": round(len(cloud) / area, 3) if area else 0.0,
+        "height_range": [round(float(low), 3), round(float(high), 3)],
+        "median_sigma": None if cloud.sigma_m is None else round(float(np.median(cloud.sigma_m)), 4),
+        "seen_once_share": _share_once(seen),
+        "gsd": gsd,
+    }
+
+
+def _share_once(seen: Surface) -> float:
+    """Share of the mapped ground that fewer than two frames have inside them."""
+    if seen.views is None or not seen.filled.any():
+        return 0.0
+    return round(float((seen.views[seen.filled] < 2).mean()), 4)
+
+
+def heights_above_ground(seen: Surface, poses: Array) -> NDArray[np.float64]:
+    """Height of each camera above the map under it, or above its median height where nothing is under it [n]."""
+    cells = seen.grid.cells(poses[:, :3, 3])
+    below = np.where(cells >= 0, seen.heights.ravel()[np.maximum(cells, 0)], np.nan)
+    return np.asarray(poses[:, 2, 3] - np.where(np.isfinite(below), below, np.nanmedian(seen.heights)))

@@ -1,0 +1,160 @@
+"""One flight becomes a map: read, align, dense cloud, rasters, report. The order of things, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from overfly import __version__
+from overfly.cloud import Cloud
+from overfly.errors import InputError
+from overfly.flights import Flight, read_flight
+from overfly.mapping.block import Block, given_block, keep_cloud, kept_cloud, read_block, write_block
+from overfly.mapping.deliver import deliver
+from overfly.mapping.report import count_text
+from overfly.mapping.settings import MapSettings
+from overfly.mapping.steps import Steps, claim, fingerprint, key_of
+
+
+def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> dict[str, Any]:
+    """Map a flight: write the products into ``out`` and return the content of ``map.json``.
+
+    Args:
+        flight_folder: a flight folder, or a plain folder of images.
+        out: folder of the results; finished steps are kept in ``out/work``.
+        **settings: see :class:`MapSettings`.
+
+    Raises:
+        InputError: the flight cannot be mapped, or ``out`` belongs to another one.
+    """
+    asked = MapSettings(**settings)
+    flight_folder, out = Path(flight_folder), Path(out)
+    flight = read_flight(flight_folder)
+    identity = key_of(fingerprint([f.path for f in flight.frames]), _camera_files(flight_folder))
+    work = claim(out, flight_folder, identity, overwrite=asked.overwrite)
+    steps = Steps(work, resume=asked.resume, show=asked.progress)
+    try:
+        return _map(flight, identity, out, asked, steps)
+    except KeyboardInterrupt:
+        kept = sorted({p.name.rsplit("-", 1)[0] for p in work.iterdir() if p.is_dir() and p.suffix == ""})
+        steps.say(
+            "stopped",
+            f"during {steps.running or 'the start'}; kept: {', '.join(kept) or 'nothing yet'}. "
+            "The same command goes on from there.",
+        )
+        raise
+
+
+def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: Steps) -> dict[str, Any]:
+    estimate = asked.cameras == "estimate" or (asked.cameras == "auto" and flight.cameras_from is None)
+    steps.say("images", _about(flight))
+    key = key_of(__version__, identity, estimate, asked.seed if estimate else None)
+    block = steps.kept(
+        "cameras",
+        key,
+        lambda scratch: estimated_block(flight, scratch, asked, steps) if estimate else given_block(flight),
+        write_block,
+        lambda folder: read_block(folder, flight),
+    )
+    steps.say("cameras", _about_block(block, flight))
+    network = None if asked.network is None else _network_key(asked)
+    key = key_of(key, asked.dense, network if asked.dense == "sweep" else None, asked.seed)
+    make: Callable[[Path], Cloud] = {
+        "sweep": lambda _: sweep_cloud(block, flight, asked, steps),
+        "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
+    }[asked.dense]
+    local = steps.kept("dense", key, make, keep_cloud, kept_cloud)
+    steps.say("dense", f"{count_text(len(local))} points by {_how(asked)}")
+    return deliver(flight, block, local, out, asked, steps)
+
+
+def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Block:
+    """Cameras estimated from the images."""
+    raise NotImplementedError
+
+
+def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:
+    """The dense cloud by semi-global matching, in the block's frame."""
+    raise NotImplementedError
+
+
+def sweep_cloud(block: Block, flight: Flight, asked: MapSettings, steps: Steps) -> Cloud:
+    """The dense cloud by the trained network, in the block's frame."""
+    from overfly.mapping.network import network_cloud, prior_pose
+
+    assert asked.network is not None
+    told = block.gps_positions()
+    priors = []
+    for frame, pose in zip(block.frames, block.poses, strict=True):
+        position = told.get(frame.name)
+        if position is not None and np.isnan(position[2]):
+            position = np.array([position[0], position[1], pose[2, 3]])
+        priors.append(prior_pose(position, frame.gimbal, pose))
+    with steps.bar("dense", "windows") as update:
+        return network_cloud(
+            block.frames,
+            asked.network,
+            ground_height=ground_height(block, flight),
+            priors=priors,
+            progress=update,
+        )
+
+
+def ground_height(block: Block, flight: Flight) -> float:
+    """Prior height of the ground in the block's frame: sparse points, else the altitude that the flight tells.
+
+    Raises:
+        InputError: neither is known.
+    """
+    heights = block.poses[:, 2, 3]
+    if block.points is not None and len(block.points) >= 10:
+        return float(np.median(block.points[:, 2]))
+    relative = [(z, f.relative_altitude) for z, f in zip(heights, block.frames, strict=True) if f.relative_altitude]
+    if isinstance(altitude := flight.facts.get("altitude"), int | float) and altitude > 0:
+        return float(np.median(heights)) - float(altitude)
+    if relative:
+        return float(np.median([z - above for z, above in relative]))
+    raise InputError(
+        "How high the cameras flew above the ground is not known: give overfly.altitude (metres) in transforms.json, "
+        "or map with --cameras estimate."
+    )
+
+
+def _about(flight: Flight) -> str:
+    gps = sum(f.gps is not None for f in flight.frames)
+    text = f"{len(flight)} images, {gps} with GPS"
+    return text if not flight.skipped else f"{text}; skipped: {', '.join(flight.skipped)}"
+
+
+def _about_block(block: Block, flight: Flight) -> str:
+    where = "estimated from the images" if block.cameras_from == "estimated" else f"given by {block.cameras_from}"
+    text = f"{where}: {len(block.frames)} of {len(flight)} images placed"
+    if block.reprojection_px is not None:
+        text += f", {block.reprojection_px:.2f} px"
+    if block.origin is not None and block.metric:
+        return f"{text}, EPSG:{block.origin.crs_epsg}"
+    return f"{text}, local frame" if block.metric else f"{text}, metric scale unknown"
+
+
+def _how(asked: MapSettings) -> str:
+    return "semi-global stereo" if asked.dense == "stereo" else f"the network {asked.network_name or ''}".strip()
+
+
+def _network_key(asked: MapSettings) -> Any:
+    """What a trained run's answer depends on: its weights."""
+    import hashlib
+
+    digest = hashlib.sha256()
+    assert asked.network is not None
+    for name, value in asked.network.network.state_dict().items():
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def _camera_files(root: Path) -> list[tuple[str, int, int]]:
+    names = ("transforms.json", "reconstruction.json", "geo.txt", "gcp_list.txt")
+    return fingerprint([root / n for n in names] + list((root / "sparse" / "0").glob("*")))

@@ -1,0 +1,64 @@
+"""What a map is asked for, checked before anything is read or written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from overfly.errors import InputError, unknown
+from overfly.mapping.network import TrainedRun
+
+CAMERAS = ("auto", "given", "estimate")
+DENSE = ("sweep", "stereo")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapSettings:
+    """What a map is asked for.
+
+    Attributes:
+        cameras: "given" takes those of the flight folder, "estimate" ignores them, "auto" takes them if there are any.
+        dense: "sweep" by a trained network, "stereo" by semi-global matching of rectified pairs.
+        network: the trained run (``overfly.run.load_run``); needed by "sweep", unused by "stereo".
+        network_name: what the user called it.
+        max_memory_gb: memory that the dense step may take; None: no limit.
+        resume: reuse finished steps of an earlier map of the same images with the same settings.
+        overwrite: replace another flight's map in the same folder.
+        ply: write ``cloud.ply`` too.
+        seed: of every random choice.
+        progress: tell each step on stderr.
+    """
+
+    cameras: str = "auto"
+    dense: str = "sweep"
+    network: TrainedRun | None = None
+    network_name: str | None = None
+    max_memory_gb: float | None = None
+    resume: bool = True
+    overwrite: bool = False
+    ply: bool = False
+    seed: int = 0
+    progress: bool = True
+
+    def __post_init__(self) -> None:
+        if self.cameras not in CAMERAS:
+            raise unknown("--cameras", self.cameras, CAMERAS)
+        if self.dense not in DENSE:
+            raise unknown("--dense", self.dense, DENSE)
+        if self.dense == "sweep" and self.network is None:
+            raise InputError(
+                "No trained network is shipped yet: give --network RUN (a run folder of train.py), "
+                "or map without one by --dense stereo."
+            )
+        if self.max_memory_gb is not None and not self.max_memory_gb > 0:
+            raise InputError(f"--max-memory {self.max_memory_gb} is not possible: give gigabytes above 0, such as 4.")
+
+    def shown(self) -> dict[str, Any]:
+        """For the report and map.json."""
+        return {
+            "cameras": self.cameras,
+            "dense": self.dense,
+            "network": self.network_name if self.dense == "sweep" else None,
+            "max_memory_gb": self.max_memory_gb,
+            "seed": self.seed,
+        }

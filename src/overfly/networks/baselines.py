@@ -1,0 +1,81 @@
+"""Answers that need no insight into the images: what a network has to beat.
+
+- *flat ground*: the initial cloud, that is the ground at its prior height;
+- *mean training cloud*: the best constant height of each initial point;
+- *nearest training window*: the reference of the training window that looks most alike;
+- the *sampling floor* is no answer but a limit: what two independent samples of the true surface score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from overfly.errors import InputError
+from overfly.networks.blocks import initial_cloud
+
+
+def flat_ground(windows: int, points: int) -> Tensor:
+    """The initial cloud for every window: [windows, points, 3], window units."""
+    return initial_cloud(points).expand(windows, -1, -1)
+
+
+def mean_cloud(references: Iterable[Tensor], points: int) -> Tensor:
+    """The initial cloud at the mean height of training references.
+
+    Args:
+        references: batches [B, N, 3], window units.
+        points: number of points of the initial cloud.
+
+    Returns:
+        [points, 3]: each point has the mean, over the windows, of the height of the reference point nearest in x, y.
+
+    Raises:
+        InputError: there is no window.
+    """
+    cloud = initial_cloud(points)
+    grid = cloud[:, :2].double().numpy()
+    total, count = np.zeros(points), 0
+    for batch in references:
+        for reference in batch.double().numpy():
+            total += heights_at(grid, reference)
+            count += 1
+    if not count:
+        raise InputError("The mean training cloud needs a training window: give a training split with images.")
+    cloud[:, 2] = torch.from_numpy(total / count).float()
+    return cloud
+
+
+def heights_at(xy: NDArray, points: NDArray) -> NDArray[np.float64]:
+    """Height of the nearest point in x, y [M] at places [M, 2] of a cloud [N, 3]."""
+    heights: NDArray[np.float64] = points[cKDTree(points[:, :2]).query(xy)[1], 2]
+    return heights
+
+
+class NearestWindow:
+    """Answers with the reference of the training window whose reference frame has the most similar descriptor."""
+
+    def __init__(self) -> None:
+        self.descriptors: list[Tensor] = []
+        self.references: list[Tensor] = []
+
+    def add(self, output: Mapping[str, Tensor], batch: Mapping[str, Tensor]) -> None:
+        """Remember training windows: the network's ``descriptor`` [B, K, D], the batch's ``reference`` [B, N, 3]."""
+        self.descriptors.append(output["descriptor"][:, 0].cpu())
+        self.references.append(batch["reference"].cpu())
+
+    def __call__(self, output: Mapping[str, Tensor]) -> Tensor:
+        """Clouds [B, N, 3], window units.
+
+        Raises:
+            InputError: nothing was added.
+        """
+        if not self.descriptors:
+            raise InputError("There is no training window to choose from: give a training split with images.")
+        similarity = output["descriptor"][:, 0].cpu() @ torch.cat(self.descriptors).T
+        return torch.cat(self.references)[similarity.argmax(1)]

@@ -1,0 +1,282 @@
+"""The whole path on small flights whose ground is known: products, numbers, resume, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from overfly.cloud import read_cloud
+from overfly.errors import InputError
+from overfly.geometry import (
+    OPENCV_FROM_OPENGL,
+    Camera,
+    Origin,
+    crs_from_enu,
+    on_plane,
+    pixel_grid,
+    pose,
+    rotation_from_gimbal,
+)
+from overfly.mapping.map import map_flight
+from overfly.mapping.settings import MapSettings
+
+CAMERA = Camera(96, 72, 80.0, 80.0, 49.0, 35.0)
+ORIGIN = {"latitude": 46.84, "longitude": -91.99, "height": 150.0}
+GROUND = 5.0
+
+
+class Plane(torch.nn.Module):
+    """Predicts a regular grid on the ground, window height 0."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.offset = torch.nn.Parameter(torch.zeros(1))
+
+    def forward(self, batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        side = torch.linspace(-0.9, 0.9, 24)
+        x, y = torch.meshgrid(side, side, indexing="ij")
+        points = torch.stack([x.flatten(), y.flatten(), 0 * x.flatten()], -1) + self.offset
+        return {"points": points.expand(len(batch["images"]), -1, -1)}
+
+
+@pytest.fixture(autouse=True)
+def quick_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing is tested in test_pictures and in the first test here; elsewhere it only takes time."""
+    if "georeferenced" not in request.node.name:
+        monkeypatch.setattr("overfly.mapping.pictures._drawn", lambda figure: np.zeros((8, 8, 3), np.uint8))
+
+
+def run() -> Any:
+    return SimpleNamespace(network=Plane().eval(), config={"frames": 2, "image_size": [48, 36]})
+
+
+def paint(world_from_camera: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
+    """A picture on the ground: red grows to the east, green to the north."""
+    xy = on_plane(pixel_grid(camera.width, camera.height), camera, world_from_camera, GROUND)[..., :2]
+    image = np.zeros((camera.height, camera.width, 3))
+    image[..., 0] = 128 + xy[..., 0]
+    image[..., 1] = 128 + xy[..., 1]
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def make_flight(root: Path, n: int = 4, *, block: dict[str, Any] | None = None, shift: float = 0.0) -> Path:
+    """n nadir images along a line northwards, 55 m above the ground, with transforms.json."""
+    (root / "images").mkdir(parents=True)
+    frames = []
+    for i in range(n):
+        world_from_camera = pose(rotation_from_gimbal(0, -90), [shift, 25.0 * (i - (n - 1) / 2), GROUND + 55.0])
+        Image.fromarray(paint(world_from_camera)).save(root / "images" / f"{i}.png")
+        matrix = (world_from_camera @ OPENCV_FROM_OPENGL).tolist()
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": matrix})
+    data: dict[str, Any] = {
+        "camera_model": "PINHOLE",
+        "fl_x": 80.0,
+        "fl_y": 80.0,
+        "cx": 49.0,
+        "cy": 35.0,
+        "w": 96,
+        "h": 72,
+    }
+    data["frames"] = frames
+    data["overfly"] = {"altitude": 55.0} if block is None else block
+    (root / "transforms.json").write_text(json.dumps(data))
+    return root
+
+
+def mapped(flight: Path, out: Path, **settings: Any) -> dict[str, Any]:
+    return map_flight(flight, out=out, **({"network": run(), "progress": False} | settings))
+
+
+def test_a_flight_with_an_origin_becomes_a_georeferenced_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = make_flight(tmp_path / "my_flight", block={"altitude": 55.0, "origin": ORIGIN})
+    before = {p: p.stat().st_mtime_ns for p in flight.rglob("*")}
+    summary = mapped(flight, tmp_path / "out", ply=True, progress=True)
+    assert {p: p.stat().st_mtime_ns for p in flight.rglob("*")} == before
+    out = tmp_path / "out"
+    names = {p.name for p in out.iterdir()}
+    assert names == {
+        "cloud.laz", "cloud.ply", "dsm.tif", "orthophoto.tif", "transforms.json", "map.json", "report.html", "work",
+    }  # fmt: skip
+    assert json.loads((out / "map.json").read_text()) == summary
+    assert {
+        "images", "registered", "points", "measured", "predicted", "gsd_m", "crs", "cameras_from", "seconds",
+        "peak_memory_mb", "warnings",
+    } <= summary.keys()  # fmt: skip
+    assert (summary["images"], summary["registered"], summary["crs"]) == (4, 4, "EPSG:32615")
+    assert summary["cameras_from"] == "transforms.json"
+    assert summary["gsd_m"] == pytest.approx(55 / 80, rel=0.02)
+    assert summary["points"] == summary["measured"] + summary["predicted"]
+    assert {"cameras", "dense", "products", "report"} <= summary["seconds"].keys()
+    cloud = read_cloud(out / "cloud.laz")
+    assert cloud.epsg == 32615
+    assert len(cloud) == summary["points"]
+    origin = Origin(46.84, -91.99, 150.0)
+    corner = crs_from_enu([[0, 0, GROUND]], origin)[0]
+    assert np.abs(cloud.points[:, 2] - corner[2]).max() < 0.01
+    assert np.abs(cloud.points[:, :2].mean(0) - corner[:2]).max() < 6
+    assert cloud.colors is not None
+    local = cloud.points - corner
+    good = np.abs(local[:, :2]).max(1) < 100
+    assert (
+        np.abs(cloud.colors[good, 0].astype(float) - 128 - local[good, 0]).max() < 4
+    )  # ENU and UTM differ by a degree
+    told = capsys.readouterr()
+    assert told.out == ""
+    for words in ("images", "given by transforms.json: 4 of 4", "EPSG:32615", "points by the network", "report.html"):
+        assert words in told.err.replace("\n", " "), words
+
+
+def test_without_an_origin_the_cloud_stays_in_the_cameras_frame(tmp_path: Path) -> None:
+    summary = mapped(make_flight(tmp_path / "f", shift=1000.0), tmp_path / "out")
+    assert summary["crs"] is None
+    assert summary["metric"]
+    assert any("no place on the Earth" in w for w in summary["warnings"])
+    cloud = read_cloud(tmp_path / "out" / "cloud.laz")
+    assert cloud.epsg is None
+    np.testing.assert_allclose(cloud.points[:, 2], GROUND, atol=2e-3)
+    assert abs(cloud.points[:, 0].mean() - 1000) < 2
+    import rasterio
+
+    with rasterio.open(tmp_path / "out" / "dsm.tif") as dsm:
+        assert dsm.crs is None
+
+
+def test_the_cameras_written_make_the_same_map_again(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "f", block={"altitude": 55.0, "origin": ORIGIN})
+    mapped(flight, tmp_path / "out")
+    from overfly.flights import read_flight
+
+    again = read_flight(flight)
+    written = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    for entry, frame in zip(written["frames"], again.frames, strict=True):
+        assert frame.world_from_camera is not None
+        np.testing.assert_allclose(np.array(entry["transform_matrix"]) @ OPENCV_FROM_OPENGL, frame.world_from_camera)
+    assert written["overfly"]["origin"]["latitude"] == 46.84
+
+
+def test_finished_steps_are_reused_and_only_where_nothing_changed(tmp_path: Path) -> None:
+    flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
+    assert mapped(flight, out)["reused"] == []
+    assert mapped(flight, out)["reused"] == ["cameras", "dense"]
+    assert mapped(flight, out, resume=False)["reused"] == []
+    other = run()
+    other.network.offset.data += 0.01
+    assert mapped(flight, out, network=other)["reused"] == ["cameras"]
+    os.utime(flight / "images" / "0.png")
+    assert mapped(flight, out)["reused"] == []
+
+
+def test_an_interruption_keeps_what_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("overfly.mapping.network.network_cloud", stop)
+        with pytest.raises(KeyboardInterrupt):
+            mapped(flight, out, progress=True)
+    assert "kept: cameras" in capsys.readouterr().err
+    assert not (out / "map.json").exists()
+    (out / "work" / "dense-0123456789abcdef.99.part").mkdir()  # as a killed process leaves it
+    assert mapped(flight, out)["reused"] == ["cameras"]
+    assert not list((out / "work").glob("*.part"))
+
+
+def test_a_folder_with_another_map_is_not_overwritten_unasked(tmp_path: Path) -> None:
+    first, second, out = make_flight(tmp_path / "a"), make_flight(tmp_path / "b", 3), tmp_path / "out"
+    mapped(first, out)
+    kept = (out / "cloud.laz").read_bytes()
+    with pytest.raises(InputError, match="map of another flight"):
+        mapped(second, out)
+    assert (out / "cloud.laz").read_bytes() == kept
+    assert mapped(second, out, overwrite=True)["images"] == 3
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "cloud.laz").write_text("precious")
+    with pytest.raises(InputError, match="unknown origin"):
+        mapped(first, tmp_path / "mine")
+    with pytest.raises(InputError, match="the flight itself"):
+        mapped(first, first)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="is a file"):
+        mapped(first, tmp_path / "file")
+    assert not (first / "work").exists()
+
+
+def test_a_moved_flight_is_still_the_same(tmp_path: Path) -> None:
+    flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
+    mapped(flight, out)
+    assert mapped(flight.rename(tmp_path / "g"), out)["reused"] == ["cameras", "dense"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"network": None}, "No trained network is shipped yet"),
+        ({"dense": "magic"}, "--dense 'magic' is unknown"),
+        ({"cameras": "some"}, "--cameras 'some' is unknown"),
+        ({"max_memory_gb": 0}, "--max-memory 0"),
+    ],
+)
+def test_wrong_settings_are_refused_before_anything_is_written(
+    tmp_path: Path, settings: dict[str, Any], words: str
+) -> None:
+    flight = make_flight(tmp_path / "f", 2)
+    with pytest.raises(InputError, match=words):
+        mapped(flight, tmp_path / "out", **settings)
+    assert not (tmp_path / "out").exists()
+    assert MapSettings(dense="stereo").shown()["network"] is None
+
+
+def test_given_cameras_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "f", 3)
+    (flight / "transforms.json").unlink()
+    with pytest.raises(InputError, match="--cameras estimate"):
+        mapped(flight, tmp_path / "out", cameras="given")
+
+
+def test_one_camera_is_no_map_and_lost_images_are_named(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "f", 4)
+    data = json.loads((flight / "transforms.json").read_text())
+    data["frames"] = data["frames"][:3]
+    (flight / "transforms.json").write_text(json.dumps(data))
+    summary = mapped(flight, tmp_path / "out")
+    assert (summary["images"], summary["registered"], summary["unregistered"]) == (4, 3, ["3.png"])
+    assert any("3.png" in w for w in summary["warnings"])
+    assert "3.png" in (tmp_path / "out" / "report.html").read_text()
+    data["frames"] = data["frames"][:1]
+    (flight / "transforms.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match="at least two"):
+        mapped(flight, tmp_path / "out1")
+
+
+def test_an_unknown_scale_is_said_everywhere_and_kept(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "f", block={"altitude": 55.0, "scale": "unknown"})
+    summary = mapped(flight, tmp_path / "out")
+    assert (summary["metric"], summary["gsd_m"], summary["crs"]) == (False, None, None)
+    assert any("Metric scale unknown" in w for w in summary["warnings"])
+    assert "Metric scale unknown" in (tmp_path / "out" / "report.html").read_text()
+    assert json.loads((tmp_path / "out" / "transforms.json").read_text())["overfly"]["scale"] == "unknown"
+
+
+def test_images_of_mixed_size_are_mapped(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "f")
+    data = json.loads((flight / "transforms.json").read_text())
+    small = CAMERA.resized(80, 60)
+    matrix = np.array(data["frames"][1]["transform_matrix"]) @ OPENCV_FROM_OPENGL
+    Image.fromarray(paint(matrix, small)).save(flight / "images" / "1.png")
+    data["frames"][1] |= {"fl_x": small.fx, "fl_y": small.fy, "cx": small.cx, "cy": small.cy, "w": 80, "h": 60}
+    (flight / "transforms.json").write_text(json.dumps(data))
+    assert mapped(flight, tmp_path / "out")["registered"] == 4

@@ -1,0 +1,183 @@
+"""Whole runs through the real command: folders, resuming, warm start, sweeps, determinism."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from overfly.errors import InputError
+from overfly.run import load_run
+from overfly.tables import read_rows
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def train(tmp_path: Path, cache: Path):  # type: ignore[no-untyped-def]
+    """Run train.py in an empty folder."""
+
+    def run(*overrides: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(ROOT / "train.py"), f"cache_dir={cache}", "trainer.accelerator=cpu", *overrides]
+        environment = {**os.environ, "OMP_NUM_THREADS": "1", "WANDB_MODE": "offline"}
+        result = subprocess.run(
+            command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=300, check=False
+        )
+        assert result.returncode == code, result.stderr[-3000:]
+        return result
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    """A finished run of the three phases."""
+    folder = tmp_path_factory.mktemp("all") / "run"
+    overrides = ["experiment=smoke", f"cache_dir={cache}", f"hydra.run.dir={folder}", "trainer.accelerator=cpu"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), *overrides], check=True, env=environment, timeout=300,
+        capture_output=True, cwd=folder.parent,
+    )  # fmt: skip
+    return folder
+
+
+def only(folder: Path, pattern: str) -> Path:
+    found = list(folder.glob(pattern))
+    assert len(found) == 1, found
+    return found[0]
+
+
+def test_a_run_of_all_phases_leaves_everything_that_the_readme_promises(finished: Path) -> None:
+    for folder in (finished, finished / "encoder", finished / "gan", finished / "full"):
+        for name in ("config.yaml", "overrides.txt", "metrics.csv", "metrics.json", "curves.png"):
+            assert (folder / name).stat().st_size > 0, folder / name
+        assert (folder / "checkpoints" / "best.ckpt").is_file()
+    assert (finished / "train.log").stat().st_size > 0
+    assert list((finished / "clouds").glob("*.ply"))
+    assert list((finished / "clouds").glob("*.png"))
+    results = json.loads((finished / "metrics.json").read_text())
+    assert list(results["phases"]) == ["encoder", "gan", "full"]
+    full = results["phases"]["full"]["metrics"]
+    assert {"val/chamfer_m2", "val/accuracy", "val/emd_sum_1024"} <= set(full)
+    assert any(key.startswith("test/chamfer_m2") for key in full)
+
+
+def test_each_phase_says_where_its_weights_came_from(finished: Path) -> None:
+    text = (finished / "train.log").read_text()
+    assert "encoder: every weight starts at random" in text
+    assert "encoder/checkpoints/best.ckpt" in text
+    assert "gan/checkpoints/best.ckpt" in text
+
+
+def test_the_weights_of_a_phase_are_those_that_the_last_one_left(finished: Path) -> None:
+    before, after = (
+        torch.load(finished / name / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
+        for name in ("encoder", "gan")
+    )
+    kept = [key for key in before if "encoder" in key and key.endswith("conv1.weight")] or [
+        key for key in before if ".encoder." in key and before[key].ndim == 4
+    ]
+    assert kept
+    for key in kept:  # the gan stage leaves the encoder frozen
+        torch.testing.assert_close(before[key], after[key], rtol=0, atol=0)
+
+
+def test_a_moved_run_is_reopened_with_equal_outputs(finished: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "elsewhere"
+    shutil.copytree(finished, moved)
+    one, two = load_run(finished), load_run(moved)
+    assert one.stage == two.stage == "full"
+    assert not two.network.training
+    for a, b in zip(one.network.state_dict().values(), two.network.state_dict().values(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert str(finished) not in (moved / "config.yaml").read_text()
+
+
+def test_a_folder_without_weights_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"best\.ckpt"):
+        load_run(tmp_path)
+    with pytest.raises(InputError, match="no run folder"):
+        load_run(tmp_path / "nowhere")
+
+
+def test_fast_dev_run_passes_through_every_phase(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train("experiment=smoke", "trainer.fast_dev_run=true")
+    run = only(tmp_path, "outputs/all/*")
+    assert json.loads((run / "full" / "metrics.json").read_text())["stage"] == "full"
+
+
+def test_from_run_starts_from_the_given_weights_and_says_so(train, finished: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train("experiment=smoke", "stage=gan", "trainer.max_epochs=1", f"from_run={finished / 'encoder'}")
+    run = only(tmp_path, "outputs/gan/*")
+    assert "encoder/checkpoints/best.ckpt" in (run / "train.log").read_text()
+
+
+def test_a_stopped_run_goes_on_counting_in_its_own_folder(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train("experiment=smoke", "stage=encoder", "trainer.max_epochs=2", "test=false")
+    run = only(tmp_path, "outputs/encoder/*")
+    first = read_rows(run / "metrics.csv")
+    train(f"resume={run.relative_to(tmp_path)}", "trainer.max_epochs=4")
+    rows = read_rows(run / "metrics.csv")
+    assert [row["epoch"] for row in rows] == [0, 1, 2, 3]
+    assert rows[:2] == first
+    assert only(tmp_path, "outputs/encoder/*") == run
+
+
+def test_resuming_a_finished_run_of_all_phases_computes_nothing_again(train, finished: Path) -> None:  # type: ignore[no-untyped-def]
+    times = {path: path.stat().st_mtime_ns for path in finished.glob("*/checkpoints/best.ckpt")}
+    result = train(f"resume={finished}")
+    assert "finished before" in result.stdout + result.stderr + (finished / "train.log").read_text()
+    assert times == {path: path.stat().st_mtime_ns for path in finished.glob("*/checkpoints/best.ckpt")}
+
+
+@pytest.mark.parametrize("stage", ["gan"])
+def test_the_same_seed_gives_bit_equal_metrics_with_any_number_of_workers(train, tmp_path: Path, stage: str) -> None:  # type: ignore[no-untyped-def]
+    for name, workers in (("zero", 0), ("two", 2), ("again", 0)):
+        train("experiment=smoke", f"stage={stage}", f"data.workers={workers}", f"hydra.run.dir={tmp_path / name}")
+    files = [(tmp_path / name / "metrics.csv").read_text() for name in ("zero", "two", "again")]
+    assert files[0] == files[1] == files[2]
+    train("experiment=smoke", f"stage={stage}", "seed=8", f"hydra.run.dir={tmp_path / 'other'}")
+    assert (tmp_path / "other" / "metrics.csv").read_text() != files[0]
+
+
+def test_a_sweep_goes_on_after_a_failed_job_and_hides_nothing(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    result = train(
+        "-m", "experiment=smoke", "stage=encoder", "altitude=100,10,150", "trainer.fast_dev_run=true", code=1
+    )
+    sweep = only(tmp_path, "outputs/sweeps/*")
+    rows = list(csv.DictReader((sweep / "summary.csv").read_text().splitlines()))
+    assert [(row["altitude"], row["status"]) for row in rows] == [
+        ("100", "completed"), ("10", "failed"), ("150", "completed"),
+    ]  # fmt: skip
+    assert "20 to 500" in rows[1]["error"]
+    assert float(rows[0]["val/loss"]) > 0
+    assert "altitude=10 is not possible" in result.stderr
+    assert "Traceback" in (sweep / rows[1]["folder"] / "train.log").read_text()
+    assert (sweep / "summary.md").is_file()
+    assert (sweep / "summary.png").is_file()
+    assert len({row["folder"] for row in rows}) == 3
+    assert not any(character in row["folder"] for row in rows for character in ":=,")
+
+
+def test_wandb_works_offline_and_is_closed(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train("experiment=smoke", "stage=encoder", "logger=wandb", "trainer.max_epochs=1", "test=false")
+    run = only(tmp_path, "outputs/encoder/*")
+    assert list(run.glob("wandb/offline-run-*/*.wandb"))
+    assert read_rows(run / "metrics.csv")
+
+
+def test_tensorboard_writes_its_events(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train("experiment=smoke", "stage=encoder", "logger=tensorboard", "trainer.max_epochs=1", "test=false")
+    assert list(tmp_path.glob("outputs/encoder/*/tensorboard/events*"))
