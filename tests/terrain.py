@@ -84,3 +84,19 @@ def _window(rng, frames, width, height, relief, points):
         "gsd": np.array(100.0 / width),
         "altitude": np.array(100.0),
     }
+
+
+def make_network(**changes):
+    """A tiny GanDecoder for images of 64 x 32 pixels, with the same random weights every time."""
+    from overfly.networks import GanDecoder
+
+    parts = {
+        "encoder": {"widths": [4, 8, 8, 16], "descriptor": 16, "match_channels": 8, "correction_width": 16},
+        "generator": {"width": 8, "blocks": 10, "upsampled_width": 4, "head_width": 16, "candidates": 2},
+        "discriminator": {"widths": [8, 16], "strides": [1, 4], "head_width": 8},
+    }
+    for name in parts:
+        parts[name] |= changes.pop(name, {})
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return GanDecoder(**{"size": [64, 32], "points": 256, "features": 32, **parts, **changes})

@@ -287,7 +287,7 @@ def _topocentric(latitude: float, longitude: float, height: float):  # type: ign
 
     return Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-        f"+step +proj=topocentric +ellps=WGS84 +lat_0={latitude!r} +lon_0={longitude!r} +h_0={height!r}"
+        f"+step +proj=topocentric +ellps=WGS84 +lat_0={float(latitude)!r} +lon_0={float(longitude)!r} +h_0={float(height)!r}"
     )
 
 

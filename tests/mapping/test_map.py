@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -172,6 +175,7 @@ def test_finished_steps_are_reused_and_only_where_nothing_changed(tmp_path: Path
     other = run()
     other.network.offset.data += 0.01
     assert mapped(flight, out, network=other)["reused"] == ["cameras"]
+    assert mapped(flight, out)["reused"] == ["cameras", "dense"]  # the one before is still there
     os.utime(flight / "images" / "0.png")
     assert mapped(flight, out)["reused"] == []
 
@@ -193,6 +197,19 @@ def test_an_interruption_keeps_what_is_finished(
     (out / "work" / "dense-0123456789abcdef.99.part").mkdir()  # as a killed process leaves it
     assert mapped(flight, out)["reused"] == ["cameras"]
     assert not list((out / "work").glob("*.part"))
+
+
+def test_a_kill_loses_only_the_running_step(tmp_path: Path) -> None:
+    flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
+    code = (
+        f"import os, signal, sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "import test_map, overfly.mapping.network as network\n"
+        "network.network_cloud = lambda *a, **k: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"test_map.mapped({str(flight)!r}, {str(out)!r})"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
+    assert not (out / "map.json").exists()
+    assert mapped(flight, out)["reused"] == ["cameras"]
 
 
 def test_a_folder_with_another_map_is_not_overwritten_unasked(tmp_path: Path) -> None:

@@ -50,6 +50,8 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
         self.settings = settings
         self.seed = seed
         self.augment = augment
+        self.twice = False
+        """Whether items hold ``reference_again`` [N, 3], an independent sample of the same surface."""
         self.windows = [
             (number, window) for number, record in enumerate(self.records) for window in _windows(record, settings)
         ]
@@ -75,6 +77,8 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
         scale = float(sample["scale"])
         sample["depth"] = np.asarray(record.depth[chosen], np.float32) / np.float32(scale)
         sample["reference"] = reference_points(record, world_from_window, scale, settings.points, rng)
+        if self.twice:
+            sample["reference_again"] = reference_points(record, world_from_window, scale, settings.points, rng)
         tensors = {name: torch.from_numpy(np.array(value)) for name, value in sample.items()}
         for name, value in (
             ("scene", int(record.facts["scene"])),

@@ -175,7 +175,6 @@ def plan_flight(
     else:
         build = {"circular": circular, "grid": grid, "double_grid": double_grid}[flight_path]
         layout = build(site, forward, side, heading_deg, frames)
-    site.check_clearance(layout.poses)
     plan = Plan(
         flight_path=flight_path,
         camera=camera,

@@ -88,7 +88,8 @@ class Site:
         return poses
 
     def outlines(self, poses: ArrayLike) -> Array:
-        """Footprints [n, m, 2] on the terrain."""
+        """Footprints [n, m, 2] on the terrain; flights through the ground are refused, see :meth:`check_clearance`."""
+        self.check_clearance(np.asarray(poses, float))
         return footprints(self.camera, poses, self.ground, self.height_range)
 
     def frame_size(self, tilt_deg: float) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ import numpy as np
 from overfly.errors import InputError
 from overfly.flights.footprint import footprints, pair_overlap
 from overfly.flights.paths import count_along, too_many
-from overfly.flights.site import MAX_FRAMES, Layout, Site
+from overfly.flights.site import MAX_FRAMES, Layout, Site, spacing_for
 from overfly.geometry import Array
 
 
@@ -105,15 +105,14 @@ def _next_frame(
     else:
         return None
     aim = overlap if overlap > 0 else 1e-4
-    low, high = 0.0, 1.6 * math.hypot(length, width)
-    # Close in on level ground first, which is cheap, then widen again for the terrain.
-    distance = _falls_to(lambda d: overlaps(d, yaw, tilt, True), low, high, aim)
-    if distance is None:
+    # Close in on level ground first, which is cheap; the terrain changes little.
+    level = _falls_to(lambda d: overlaps(d, yaw, tilt, True), 0.0, 1.6 * math.hypot(length, width), aim)
+    if level is None:
         return None
-    near = _falls_to(lambda d: overlaps(d, yaw, tilt, False), 0.7 * distance, 1.4 * distance, aim)
-    distance = near if near is not None else _falls_to(lambda d: overlaps(d, yaw, tilt, False), low, 1.5 * high, aim)
-    if distance is None:
-        return None
+    try:
+        distance = spacing_for(lambda d: float(overlaps(np.array([d]), yaw, tilt, False)[0]), level, overlap)
+    except InputError:
+        return None  # another direction or heading may do
     pose = _standing(site, middle + distance * toward, yaw, tilt)[0]
     return pose, middle + distance * toward, (yaw, tilt)
 

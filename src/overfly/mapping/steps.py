@@ -110,14 +110,14 @@ class Steps:
             shutil.rmtree(place, ignore_errors=True)
             os.replace(part, place)
             shutil.rmtree(scratch, ignore_errors=True)
-        self._forget_others(step, key)
+        self._forget_old(step)
         return result
 
-    def _forget_others(self, step: str, key: str) -> None:
-        """Results of the same step with other settings would only fill the disk."""
-        for other in self.folder.glob(f"{step}-*"):
-            if not other.name.startswith(f"{step}-{key}"):
-                shutil.rmtree(other, ignore_errors=True)
+    def _forget_old(self, step: str, most: int = 2) -> None:
+        """Keep the newest results of a step: more, with ever other settings, would only fill the disk."""
+        kept = sorted(self.folder.glob(f"{step}-*"), key=lambda p: p.stat().st_mtime, reverse=True)
+        for old in kept[most:]:
+            shutil.rmtree(old, ignore_errors=True)
 
     @contextmanager
     def bar(self, step: str, what: str) -> Iterator[Callable[[int, int], None]]:

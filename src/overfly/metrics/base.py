@@ -68,10 +68,14 @@ class CloudMetric(Metric):
             raise ValueError(f"Pairs of clouds are compared, but there are {len(predicted)} and {len(target)} clouds.")
         batch = [*predicted, *target]
         last = CloudMetric._last
-        if last is None or len(last[0]) != len(batch) or not all(map(torch.equal, last[0], batch)):
+        if last is None or len(last[0]) != len(batch) or not all(map(_same, last[0], batch)):
             found = [distances(p, t) for p, t in zip(predicted, target)]
             last = CloudMetric._last = ([points.detach().clone() for points in batch], found)
         return last[1]
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    return a.device == b.device and a.dtype == b.dtype and torch.equal(a, b)
 
 
 def _per_pair(values: Tensor | None, what: str, n: int) -> list[float | None]:

@@ -11,7 +11,10 @@ from overfly.metrics.functional import PAPER_POINTS, emd_m, subset
 
 
 class EmdM(CloudMetric):
-    """Mean distance over the best one-to-one assignment of ``points`` points (random subsets of larger clouds); metres."""
+    """Mean distance over the best one-to-one assignment; metres.
+
+    Clouds of more than ``points`` points are thinned to random subsets, as in :class:`EmdSum1024`.
+    """
 
     def __init__(self, *, points: int = PAPER_POINTS, seed: int = 0, **kwargs: Any) -> None:
         super().__init__("emd_m", **kwargs)

@@ -82,7 +82,7 @@ def thin(points: Array, n: int) -> Array:
     # Landscapes are surfaces: the points that remain go with the inverse square of the voxel's edge.
     plan = np.sort(np.ptp(points, axis=0))[1:]
     size = float(np.sqrt(max(plan[0], plan[1] / n) * plan[1] / n)) or 1.0
-    while len(kept := voxelthin(points, size)) > n:
+    while len(kept := voxel_thin(points, size)) > n:
         size *= 1.2
     return points[kept]
 

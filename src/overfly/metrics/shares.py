@@ -30,7 +30,7 @@ class _Share(CloudMetric):
         super().__init__(f"{self.name}_{threshold:g}{unit}", **kwargs)
         self.threshold, self.unit = threshold, unit
 
-    def update(  # type: ignore[override]
+    def update(
         self, predicted: Tensor, target: Tensor, *, scale: Tensor | None = None, gsd: Tensor | None = None
     ) -> None:
         """Add a batch of pairs; ``gsd`` [B] is metres per pixel, needed for thresholds in that unit."""

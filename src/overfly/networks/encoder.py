@@ -93,12 +93,11 @@ class Encoder(Part):
         pooled = widths[3] * (width // 32) * (height // 32)
         self.feature_head = nn.Sequential(nn.Linear(pooled, features), nn.PReLU())
         self.retrieval_head = nn.Linear(features, descriptor)
-        self.correction_head = nn.Sequential(
-            nn.Linear(2 * pooled + 12, correction_width), nn.PReLU(), nn.Linear(correction_width, 6)
-        )
+        last = nn.Linear(correction_width, 6)
+        self.correction_head = nn.Sequential(nn.Linear(2 * pooled + 12, correction_width), nn.PReLU(), last)
         with torch.no_grad():  # no correction is the best first guess
-            self.correction_head[2].weight.mul_(0.01)
-            self.correction_head[2].bias.zero_()
+            last.weight.mul_(0.01)
+            last.bias.zero_()
 
     def forward(self, images: Tensor) -> Encoded:
         """Encode M images [M, 3, H, W] in 0..1."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+import os
+import sys
+from functools import cache, lru_cache
 
 import numpy as np
 import warp as wp
@@ -19,6 +21,21 @@ NEAR = 0.05
 """Nothing nearer than this (metres) is seen."""
 
 
+@cache
+def start() -> None:
+    """Start warp once, without its note on stderr that there is no GPU, which comes from below Python."""
+    sys.stderr.flush()
+    held = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        wp.init()
+    finally:
+        os.dup2(held, 2)
+        os.close(held)
+        os.close(nowhere)
+
+
 class DeviceScene:
     """The arrays of a scene, with the faces sorted into chunks that lie together.
 
@@ -29,6 +46,9 @@ class DeviceScene:
     """
 
     def __init__(self, scene: Scene, device: str) -> None:
+        start()
+        if device != "cpu" and not wp.is_cuda_available():
+            raise InputError(f"The scene cannot be rendered on {device!r}: warp finds no GPU here, use 'cpu'.")
         self.device = device
         order = _morton_order(scene)
         faces = scene.faces[order]

@@ -99,6 +99,7 @@ class Scene:
         uv: [V, 2] float32 texture coordinates (v upward), for faces of material TEXTURE.
         texture: [rows, cols, 3] uint8, row 0 = top (v = 1).
         origin: where the local frame stands on the Earth, if known.
+        offset: what was subtracted from a file's coordinates; add it to get them back (0 where ``origin`` is known).
         seed: for the kernel's noise.
     """
 
@@ -116,6 +117,7 @@ class Scene:
     uv: NDArray[np.float32] | None = None
     texture: NDArray[np.uint8] | None = None
     origin: Origin | None = None
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     seed: int = 0
 
     @cached_property
@@ -169,11 +171,15 @@ def make_scene(style: str, seed: int, *, size_m: float = 400.0, relief: float | 
     return build(style, int(seed), float(size_m), relief)
 
 
-def load_scene(path: Path | str) -> Scene:
+def load_scene(path: Path | str, *, orthophoto: Path | str | None = None) -> Scene:
     """Read a scene from a mesh (.ply, .obj, .glb), a lidar cloud (.laz, .las, .ply without faces) or a DSM (.tif).
 
-    A DSM takes its colours from ``<name>_ortho.tif`` or ``orthophoto.tif`` beside it. Files in a CRS are shifted to a
-    local origin.
+    Files in a CRS are taken to local ENU metres about their centre (heights as ellipsoidal, in the CRS's own unit);
+    files without one keep their coordinates, shifted only where they lie beyond 10 km.
+
+    Args:
+        path: the file.
+        orthophoto: colours of a DSM; None takes ``<name>_ortho.tif`` or ``orthophoto.tif`` beside it, else grey.
 
     Raises:
         InputError: missing, of another kind, broken, empty or holding NaN.
@@ -188,7 +194,7 @@ def load_scene(path: Path | str) -> Scene:
         raise InputError(f"The scene file {path} does not exist.")
     from overfly.scenes.files import load
 
-    return load(path)
+    return load(path, None if orthophoto is None else Path(orthophoto))
 
 
 def open_scene(scene: Path | str, seed: int = 0, *, size_m: float = 400.0) -> Scene:

@@ -173,7 +173,11 @@ def shade_ray(
     p = eye + local
     far = wp.length(local)
     flat = wp.normalize(wp.cross(e1, e2))
-    n = wp.normalize(s.normals[face[0]] * (1.0 - w1 - w2) + s.normals[face[1]] * w1 + s.normals[face[2]] * w2)
+    n = s.normals[face[0]] * (1.0 - w1 - w2) + s.normals[face[1]] * w1 + s.normals[face[2]] * w2
+    if wp.dot(n, n) > 0.25:
+        n = wp.normalize(n)
+    else:
+        n = flat
     facing = wp.dot(flat, local)
     if facing > 0.0:
         flat = -flat

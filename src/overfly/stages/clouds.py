@@ -31,7 +31,7 @@ def window_metrics(points: ArrayLike, reference: ArrayLike, scale: float) -> dic
         - ``height_error_m``: mean absolute difference between the height of a reference point and that of the
           predicted point nearest to it in x and y;
         - ``precision_2pct``, ``recall_2pct``, ``near_2pct``, ``fscore_2pct``: shares of predicted points within 2 % of
-          the footprint's width of the reference, the reverse, their mean (design: the full network's accuracy), F-score.
+          the footprint's width of the reference, the reverse, their mean (the full stage's accuracy), F-score.
 
     Raises:
         InputError: a cloud is empty or not finite.

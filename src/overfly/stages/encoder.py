@@ -20,7 +20,8 @@ class EncoderStage(Stage):
     """Trains ``network.encoder`` on InfoNCE at true correspondences, the retrieval loss and the correction loss.
 
     *Accuracy* is the share of key points whose nearest neighbour in the overlapping frame lies within 2 px of the
-    truth; ``retrieval_top1`` is the share of frames whose nearest other frame, among all of the split, sees common ground.
+    truth; ``retrieval_top1`` is the share of frames whose nearest other frame, among all of the split, sees
+    common ground.
 
     Args:
         pixels: correspondences drawn per pair of frames and step.
@@ -84,6 +85,8 @@ class EncoderStage(Stage):
     def _retrieval(self, split: str) -> None:
         top1 = self.top1[split]
         assert isinstance(top1, RetrievalTop1)
+        if not top1.update_called:
+            return
         value = top1.compute()
         top1.reset()
         if torch.isfinite(value):

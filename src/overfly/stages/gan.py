@@ -72,19 +72,16 @@ class GanStage(Stage):
             if self.freeze_encoder and not self.frozen:
                 log.info("encoder: not trained yet, so it is trained along with the generator instead of being frozen")
         self.part("encoder").requires_grad_(not self.frozen)
-        self.train()
+
+    def on_train_epoch_start(self) -> None:
+        if self.frozen:
+            self.part("encoder").eval()  # its batch statistics stay, too
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["encoder_frozen"] = bool(self.frozen)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.frozen = bool(checkpoint["encoder_frozen"])
-
-    def train(self, mode: bool = True) -> GanStage:
-        super().train(mode)
-        if self.frozen:
-            self.part("encoder").eval()
-        return self
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
         output = self.network(batch)

@@ -12,7 +12,7 @@ class RetrievalTop1(Metric):
     """Share of frames whose nearest other frame, by descriptor, overlaps them on the ground.
 
     The gallery of a frame is its own window and all windows of other scenes; other windows of its own scene are left
-    out, since how much they overlap it is unknown. Frames that overlap no other are not asked. NaN before any was.
+    out, since how much they overlap it is unknown. Frames that overlap no other are not asked. NaN if none was.
     A negative overlap marks the same frame, which is no candidate.
     """
 
@@ -34,8 +34,6 @@ class RetrievalTop1(Metric):
         self.scenes.append(scenes)
 
     def compute(self) -> Tensor:
-        if not self.descriptors:
-            return torch.tensor(float("nan"))
         descriptors, overlaps, scenes = (dim_zero_cat(x) for x in (self.descriptors, self.overlaps, self.scenes))
         n, k = descriptors.shape[:2]
         gallery, frame_scene = descriptors.flatten(0, 1), scenes.repeat_interleave(k)
