@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -42,29 +42,33 @@ def fly(
     overlap: Annotated[float, typer.Option(help="Forward overlap, percent, 0 to 95.")] = 60,
     side_overlap: Annotated[float | None, typer.Option(help="Between lines, percent. Default: as --overlap.")] = None,
     altitude: Annotated[float, typer.Option(help="Metres above ground, 20 to 500.")] = 150,
-    camera: Annotated[str, typer.Option(help="A camera preset.")] = "mavic3e",
-    width: Annotated[int, typer.Option(help="Image width, pixels.")] = 800,
-    area: Annotated[float | None, typer.Option(help="Side of the square that is flown over, metres.")] = None,
-    seed: Annotated[int, typer.Option(help="Landscape, light and noise.")] = 0,
-    gps_sigma: Annotated[float, typer.Option(help="GPS error, metres horizontally; 3 x that vertically.")] = 0.0,
+    camera: Annotated[str, typer.Option(help="A camera: phantom4, p4p, mavic2pro, mavic3e, p1, ...")] = "p4p",
+    width: Annotated[int | None, typer.Option(help="Image width, pixels. Default: 800.")] = None,
+    height: Annotated[int | None, typer.Option(help="Image height, pixels. Default: by the sensor.")] = None,
+    area: Annotated[float | None, typer.Option(help="Side of the square flown over, metres. Default: 5 x 5 frames.")] = None,
+    frames: Annotated[int | None, typer.Option(help="At most so many frames.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the landscape, the light and the noise.")] = 0,
+    noise: Annotated[str, typer.Option(help="Of GPS and gimbal in the images: none, gps, rtk, ...")] = "none",
+    processes: Annotated[int, typer.Option(help="That render side by side.")] = 1,
 ) -> None:
     """Photograph a landscape whose geometry is known: a flight folder with exact cameras and a reference cloud."""
     from overfly.flights import fly as fly_over
 
-    _done(
-        fly_over(
-            scene,
-            out=out,
-            flight_path=path,
-            overlap=overlap,
-            side_overlap=side_overlap,
-            altitude=altitude,
-            camera=camera,
-            width=width,
-            area_m=area,
-            seed=seed,
-            gps_sigma_m=gps_sigma,
-        )
+    fly_over(
+        scene,
+        out=out,
+        flight_path=path,
+        overlap=overlap,
+        side_overlap=side_overlap,
+        altitude=altitude,
+        camera=camera,
+        width=width,
+        height=height,
+        area_m=area,
+        frames=frames,
+        seed=seed,
+        noise=noise,
+        processes=processes,
     )
 
 
@@ -72,27 +76,40 @@ def fly(
 def map_(
     flight: Annotated[Path, typer.Argument(help="A flight folder, or any folder of drone photos.")],
     out: Annotated[Path, typer.Option(help="Where the map goes.")],
-    network: Annotated[str | None, typer.Option(help="A run folder with trained weights.")] = None,
-    cameras: Annotated[str, typer.Option(help="auto: given ones if there are any; given; estimate.")] = "auto",
-    dense: Annotated[str | None, typer.Option(help="sweep: the network; stereo: classical. Default: by --network.")] = None,
-    max_memory: Annotated[float, typer.Option(help="Memory to use at most, GB.")] = 6.0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted map in --out.")] = False,
+    network: Annotated[str | None, typer.Option(help="A run folder with trained weights, for --dense sweep.")] = None,
+    cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
+    dense: Annotated[
+        str | None, typer.Option(help="sweep (the network) or stereo. Default: sweep with --network, else stereo.")
+    ] = None,
+    max_memory: Annotated[float | None, typer.Option(help="Memory for the dense step, GB.")] = None,
+    resume: Annotated[bool, typer.Option(help="Reuse finished steps of an interrupted map in --out.")] = True,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another flight's map in --out.")] = False,
     ply: Annotated[bool, typer.Option("--ply", help="Write cloud.ply too.")] = False,
+    seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
 ) -> None:
     """Photographs in, map out: coloured cloud, height raster, orthophoto and report."""
     from overfly.mapping.map import map_flight
 
-    _done(
-        map_flight(
-            flight,
-            out=out,
-            network=network,
-            cameras=cameras,
-            dense=dense,
-            max_memory_gb=max_memory,
-            resume=resume,
-            ply=ply,
-        )
+    run = None
+    if network is not None:
+        from overfly.run import load_run
+
+        run = load_run(network)
+    if dense is None:
+        dense = "stereo" if run is None else "sweep"
+        print(f"--dense {dense}, since {'no' if run is None else 'a'} --network was given", file=sys.stderr)
+    map_flight(
+        flight,
+        out=out,
+        network=run,
+        network_name=network,
+        cameras=cameras,
+        dense=dense,
+        max_memory_gb=max_memory,
+        resume=resume,
+        overwrite=overwrite,
+        ply=ply,
+        seed=seed,
     )
 
 
@@ -101,18 +118,22 @@ def evaluate(
     cloud: Annotated[Path, typer.Argument(help="The cloud to judge: .ply, .las or .laz.")],
     reference: Annotated[Path, typer.Argument(help="The true cloud.")],
     align: Annotated[str, typer.Option(help="none, shift, rigid or similarity.")] = "none",
+    gsd: Annotated[float | None, typer.Option(help="Metres per pixel: adds F-scores at 1, 2, 3 and 5 GSD.")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures here.")] = None,
 ) -> None:
     """Measure a cloud against a reference: Chamfer, EMD, F-score, accuracy, completeness; in metres."""
+    from json import dumps
+
+    from rich.console import Console
+
     from overfly.metrics.evaluate import evaluate as measure
     from overfly.metrics.evaluate import format_table
 
-    result = measure(cloud, reference, align=align)
+    result = measure(cloud, reference, align=align, gsd_m=gsd)
     if json is not None:
-        from overfly.metrics.evaluate import write_json
-
-        write_json(result, json)
-    print(format_table(result))
+        json.parent.mkdir(parents=True, exist_ok=True)
+        json.write_text(dumps(result, indent=2) + "\n")
+    Console().print(format_table(result))
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
@@ -121,11 +142,6 @@ def train(context: typer.Context) -> None:
     from overfly.run import main as run
 
     raise SystemExit(run(context.args))
-
-
-def _done(result: Any) -> None:
-    if isinstance(result, str):
-        print(result)
 
 
 def main() -> None:

@@ -82,7 +82,7 @@ def depth_overlap(camera, a, b, ground):
 
 
 @pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize(("altitude", "overlap"), [(60, 30), (150, 80), (400, 50)])
+@pytest.mark.parametrize(("altitude", "overlap"), [(60, 30), (300, 80)])
 def test_overlap_over_hills_with_a_lens_by_depth(path, altitude, overlap):
     result = plan(path, altitude=altitude, overlap=overlap, ground=hilly, camera=SMALL, frames=7, side=30)
     poses = result.world_from_camera
@@ -178,8 +178,8 @@ def test_large_areas_get_concentric_orbits():
 
 def test_random_walk_stays_in_its_area_and_each_pair_overlaps_as_asked():
     area = (-150.0, -150.0, 150.0, 150.0)
-    result = plan("random", altitude=60, overlap=60, area=area, frames=40)
-    assert len(result) == 40
+    result = plan("random", altitude=60, overlap=60, area=area, frames=25)
+    assert len(result) == 25
     yaws = np.array([gimbal_from_rotation(p[:3, :3])[0] for p in result.world_from_camera])
     assert np.std(np.diff(yaws)) > 20
     middles = np.stack([footprint(CAMERA, p, 0.0).mean(0) for p in result.world_from_camera])

@@ -12,7 +12,17 @@ import pytest
 
 from overfly.mapping.cautions import cautions
 from overfly.mapping.pictures import png
-from overfly.mapping.report import Caution, Picture, area_text, count_text, duration, length_text, verdict, write_report
+from overfly.mapping.report import (
+    Caution,
+    Picture,
+    area_text,
+    count_text,
+    density_text,
+    duration,
+    length_text,
+    verdict,
+    write_report,
+)
 
 
 def summary(**changes: Any) -> dict[str, Any]:
@@ -125,6 +135,7 @@ def test_verdict_counts_and_names_what_is_predicted() -> None:
         (duration(7800), "2 h 10 min"),
         (count_text(56_789), "56 789"), (length_text(0.183), "18.3 cm"), (length_text(1.5), "1.50 m"),
         (area_text(9_999), "9 999 m²"), (area_text(2e6), "2.00 km²"),
+        (density_text(0.407), "0.41"), (density_text(1234.5), "1 234"),
     ],
 )  # fmt: skip
 def test_numbers_for_people(text: str, expected: str) -> None:

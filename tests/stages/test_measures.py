@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from overfly.metrics import ChamferM, ChamferM2, ChamferSum1024
 from overfly.networks.blocks import initial_cloud
 from overfly.networks.matching import cell_pixels, true_correspondences
 from overfly.stages.clouds import window_emd, window_metrics
@@ -152,3 +153,16 @@ def test_key_points_of_the_analytic_scene_are_truly_there() -> None:
     both = visible & seen
     assert both.sum() > 50
     assert (back - pixels)[both].abs().max() < 0.05
+
+
+def test_window_metrics_agree_with_the_metric_classes() -> None:
+    generator = np.random.default_rng(0)
+    cloud, reference = generator.normal(0, 1, (2, 1024, 3))
+    found = window_metrics(cloud, reference, 40.0)
+    pair, scale = (torch.from_numpy(cloud)[None], torch.from_numpy(reference)[None]), torch.tensor([40.0])
+    for metric, key in ((ChamferM2(), "chamfer_m2"), (ChamferM(), "chamfer_m")):
+        metric.update(*pair, scale=scale)
+        assert float(metric.compute()) == pytest.approx(found[key], rel=1e-6)
+    paper = ChamferSum1024()
+    paper.update(*pair)
+    assert float(paper.compute()) == pytest.approx(found["chamfer_sum_1024"], rel=1e-6)

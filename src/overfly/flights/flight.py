@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -79,13 +80,14 @@ class Frame:
         from PIL import Image
 
         try:
-            with Image.open(self.path) as image:
+            with warnings.catch_warnings(), Image.open(self.path) as image:
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # aerial cameras exceed 90 Mpx
                 if image.mode in ("I;16", "I;16B", "I;16L", "I"):
                     values = np.asarray(image, np.float64)
                     gray = np.clip(values / 256, 0, 255).astype(np.uint8)
                     return np.repeat(gray[..., None], 3, axis=-1)
                 return np.asarray(image.convert("RGB"))
-        except (OSError, SyntaxError, ValueError) as error:
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise InputError(
                 f"The image {self.path} cannot be decoded ({error}): copy it again from the drone, or remove it."
             ) from error

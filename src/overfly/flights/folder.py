@@ -115,6 +115,8 @@ def _check_count(root: Path, frames: list[Frame], skipped: dict[str, str]) -> No
 
 
 def _read_frames(root: Path, folder: Path, paths: list[Path]) -> tuple[list[Frame], list[Facts], dict[str, str]]:
+    from PIL.Image import DecompressionBombError
+
     frames, facts, skipped = [], [], {}
     for path in paths:
         base = folder if path.is_relative_to(folder) else root
@@ -122,7 +124,7 @@ def _read_frames(root: Path, folder: Path, paths: list[Path]) -> tuple[list[Fram
         try:
             reason = defect(path)
             found = read_facts(path) if reason is None else None
-        except (OSError, SyntaxError, ValueError) as error:
+        except (OSError, SyntaxError, ValueError, DecompressionBombError) as error:
             reason, found = str(error).split("\n")[0] or "cannot be read", None
         if found is None:
             skipped[name] = reason or "cannot be read"

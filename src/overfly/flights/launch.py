@@ -6,29 +6,24 @@ import hashlib
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from overfly.cloud import write_cloud
 from overfly.errors import InputError
 from overfly.files import replacing
-from overfly.flights.cameras import CameraPreset, find_preset
+from overfly.flights.cameras import find_preset
 from overfly.flights.flight import Frame
-from overfly.flights.images import defect
+from overfly.flights.footprint import footprints, polygons
 from overfly.flights.noise import PoseNoise, noise_model
 from overfly.flights.plan import ALTITUDE_RANGE, DEFAULT_TILT_DEG, OVERLAP_RANGE, PATHS, Plan, check_number, plan_flight
-from overfly.flights.reference import reference_cloud
+from overfly.flights.render import render_frames, stamps_of, write_reference
 from overfly.flights.site import Area, Site
 from overfly.flights.transforms import write_transforms
-from overfly.flights.write import Stamp, frame_name, remove_leftovers, stamped_frame, write_frame
-from overfly.geometry import Array, Camera, Origin, gimbal_from_rotation
+from overfly.flights.write import frame_name, stamped_frame
+from overfly.geometry import Array, Camera, Origin
 
 if TYPE_CHECKING:
     from overfly.scenes import Appearance, Scene
@@ -116,28 +111,17 @@ def fly(
         extent = default_area(flight_path, pinhole, altitude, overlap, side, tilt)
     else:
         extent = (check_number("area_m", area_m, 1, 100_000, "metres"),) * 2
+    options: dict[str, Any] = {"altitude": altitude, "overlap": overlap, "side_overlap": side, "camera": pinhole}
+    options |= {"tilt_deg": tilt_deg, "heading_deg": heading_deg, "frames": frames}
     if isinstance(scene, str | Path):
-        # The landscape must reach under every footprint; its rim is a tenth wider than the flight.
-        reach = altitude * math.tan(math.radians(min(tilt + pinhole.fov_deg[1] / 2, 75))) if tilt else 0.0
-        needed = 1.1 * (max(extent) + (reach if flight_path == "circular" else 0.2 * reach))
-        scene = open_scene(scene, seed, size_m=float(np.clip(math.ceil(needed / 50) * 50, *SCENE_SIZE_M)))
+        scene = open_scene(scene, seed, size_m=_scene_size(flight_path, extent, seed, options))
     x0, y0, x1, y1 = scene.extent
+    if area_m is None:
+        extent = min(extent[0], x1 - x0), min(extent[1], y1 - y0)
     cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
     area: Area = (cx - extent[0] / 2, cy - extent[1] / 2, cx + extent[0] / 2, cy + extent[1] / 2)
-    plan = plan_flight(
-        flight_path,
-        area,
-        altitude=altitude,
-        overlap=overlap,
-        side_overlap=side,
-        camera=pinhole,
-        ground=scene.ground,
-        rng=np.random.default_rng([seed, 1]),
-        tilt_deg=tilt_deg,
-        heading_deg=heading_deg,
-        frames=frames,
-        terrain_follow=terrain_follow,
-    )
+    rng = np.random.default_rng([seed, 1])
+    plan = plan_flight(flight_path, area, ground=scene.ground, rng=rng, terrain_follow=terrain_follow, **options)
     origin = origin or scene.origin or DEFAULT_ORIGIN
     facts = {
         "altitude": plan.altitude,
@@ -153,17 +137,54 @@ def fly(
         "noise": asdict(model),
     }
     settings = [supersample, quality, reference_points, repr(appearance), asdict(origin)]
+    for remark in remarks(scene, plan):
+        sys.stderr.write(f"Note: {remark}\n")
     _claim(out, _key(scene, plan, facts, settings))
-    stamps = _stamps(plan, origin, model, preset, seed)
-    _render(scene, plan, stamps, out, appearance, supersample, quality, seed, processes)
+    stamps = stamps_of(plan, origin, model, preset, seed)
+    render_frames(scene, plan, stamps, out, appearance, supersample, quality, seed, processes)
     written = [
         stamped_frame(out / "images" / frame_name(i), plan.camera, pose, stamp, i)
         for i, (pose, stamp) in enumerate(zip(plan.world_from_camera, stamps, strict=True))
     ]
     if reference_points and not (out / "reference.laz").is_file():
-        _write_reference(scene, plan, out, reference_points, seed)
+        write_reference(scene, plan, out, reference_points, seed)
     write_transforms(out / "transforms.json", written, origin, facts)
     return plan, written
+
+
+def _scene_size(flight_path: str, extent: tuple[float, float], seed: int, options: dict[str, Any]) -> float:
+    """Side in metres of a scene that reaches a little beyond every footprint, planned as if the ground were level."""
+    x, y = extent[0] / 2, extent[1] / 2
+
+    def level(xy: Array) -> Array:
+        return np.zeros(len(xy))
+
+    plan = plan_flight(flight_path, (-x, -y, x, y), ground=level, rng=np.random.default_rng([seed, 1]), **options)
+    outlines = footprints(plan.camera, plan.world_from_camera, level, (0.0, 0.0))
+    needed = 2.1 * float(np.abs(outlines).max())
+    return float(np.clip(math.ceil(needed / 50) * 50, *SCENE_SIZE_M))
+
+
+def remarks(scene: Scene, plan: Plan) -> list[str]:
+    """What is odd about flying this plan over this scene: frames beside the scene, cameras among its buildings."""
+    import shapely
+
+    sentences = []
+    site = Site(plan.camera, scene.ground, plan.area, plan.altitude, plan.tilt_deg, False)
+    seen = shapely.union_all(polygons(site.outlines(plan.world_from_camera)))
+    beside = 100 * (1 - shapely.area(shapely.intersection(seen, shapely.box(*scene.extent))) / shapely.area(seen))
+    if beside > 5:
+        sentences.append(
+            f"{beside:.0f} % of the ground that this flight sees lies beside the scene {scene.name}: fly lower or "
+            "give a larger scene."
+        )
+    top, lowest = float(scene.bounds[1][2]), float(plan.world_from_camera[:, 2, 3].min())
+    if lowest < top:
+        sentences.append(
+            f"The flight is {top - lowest:.0f} m below the top of the scene {scene.name}: cameras may stand inside "
+            "buildings; fly higher."
+        )
+    return sentences
 
 
 def _check(flight_path: str, altitude: float, overlap: float, side: float, seed: int, processes: int) -> None:
@@ -210,109 +231,3 @@ def _claim(out: Path, key: str) -> None:
         raise InputError(f"{out} is not empty and holds no flight of this command: give another folder.")
     with replacing(record) as temporary:
         temporary.write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")
-
-
-def _stamps(plan: Plan, origin: Origin, model: PoseNoise, preset: CameraPreset | None, seed: int) -> list[Stamp]:
-    rng = np.random.default_rng([seed, 2])
-    poses = plan.world_from_camera
-    positions = model.positions(poses[:, :3, 3], rng)
-    angles = model.angles([gimbal_from_rotation(p[:3, :3]) for p in poses], rng)
-    names = {"make": preset.make, "model": preset.model} if preset is not None else {}
-    focal = preset.focal_mm if preset is not None else None
-    return [
-        Stamp(position, (yaw, pitch, roll), plan.ground_height, origin, focal_mm=focal, **names)
-        for position, (yaw, pitch, roll) in zip(positions, angles.tolist(), strict=True)
-    ]
-
-
-_WORKER: dict[str, Any] = {}
-
-
-def _start_worker(scene: Scene) -> None:
-    from overfly.scenes import Renderer
-
-    _WORKER["renderer"] = Renderer(scene)
-
-
-def _shoot(
-    path: Path, camera: Camera, pose: Array, stamp: Stamp, index: int, look: Appearance | None, options: tuple
-) -> int:
-    supersample, quality, seed = options
-    rng = np.random.default_rng([seed, 3, index])
-    renderer = _WORKER["renderer"]
-    rendered = renderer.render(camera, pose, supersample=supersample, appearance=look, rng=rng)
-    write_frame(path, rendered.image, camera, pose, stamp, index, quality=quality)
-    return index
-
-
-def _render(
-    scene: Scene,
-    plan: Plan,
-    stamps: list[Stamp],
-    out: Path,
-    look: Appearance | None,
-    supersample: int,
-    quality: int,
-    seed: int,
-    processes: int,
-) -> None:
-    """Render the frames that are not there yet."""
-    folder = out / "images"
-    folder.mkdir(exist_ok=True)
-    remove_leftovers(folder)
-    paths = [folder / frame_name(i) for i in range(len(plan))]
-    todo = [i for i, path in enumerate(paths) if not path.is_file() or defect(path) is not None]
-    options = (supersample, quality, seed)
-    jobs = [(paths[i], plan.camera, plan.world_from_camera[i], stamps[i], i, look, options) for i in todo]
-    with _progress("Rendering frames", len(plan), len(plan) - len(todo)) as advance:
-        if processes == 1 or len(jobs) < 2:
-            if jobs:
-                _start_worker(scene)
-            for job in jobs:
-                _shoot(*job)
-                advance()
-            _WORKER.clear()
-            return
-        context = get_context("spawn")
-        with ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker, initargs=(scene,)) as pool:
-            for _ in pool.map(_shoot, *zip(*jobs, strict=True), chunksize=1):
-                advance()
-
-
-def _write_reference(scene: Scene, plan: Plan, out: Path, n: int, seed: int) -> None:
-    from overfly.scenes import Renderer
-
-    site = Site(plan.camera, scene.ground, plan.area, plan.altitude, plan.tilt_deg, False)
-    outlines = site.outlines(plan.world_from_camera).reshape(-1, 2)
-    (x0, y0), (x1, y1) = outlines.min(0).tolist(), outlines.max(0).tolist()
-    renderer = Renderer(scene)
-    with _progress("Reference cloud", len(plan), 0) as advance:
-
-        def counted(poses: Iterable) -> Iterator:
-            for pose in poses:
-                yield pose
-                advance()
-
-        cloud = reference_cloud(
-            scene,
-            plan.camera,
-            plan.world_from_camera,
-            lambda pose: renderer.depth(plan.camera, pose),
-            (x0, y0, x1, y1),
-            n,
-            np.random.default_rng([seed, 4]),
-            counted,
-        )
-    write_cloud(cloud, out / "reference.laz")
-
-
-@contextmanager
-def _progress(what: str, total: int, done: int) -> Iterator[Any]:
-    """A bar on stderr; the value is the function that advances it by one."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(file=sys.stderr), transient=False) as bar:
-        task = bar.add_task(what, total=total, completed=done)
-        yield lambda: bar.advance(task)

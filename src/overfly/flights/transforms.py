@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -146,7 +147,7 @@ def write_transforms(
     """Write the frames that have a camera and a pose; intrinsics go to the top where all frames share them.
 
     Args:
-        path: the JSON file; image paths are written relative to its folder where they lie below it.
+        path: the JSON file; image paths are written relative to its folder.
         frames: order is kept.
         origin: of the local ENU frame; None for an unknown one.
         facts: further entries of the ``overfly`` block, plain values.
@@ -161,8 +162,7 @@ def write_transforms(
     folder = path.parent.resolve()
     for frame in posed:
         assert frame.camera is not None
-        resolved = frame.path.resolve()
-        relative = resolved.relative_to(folder) if resolved.is_relative_to(folder) else resolved
+        relative = Path(os.path.relpath(frame.path.resolve(), folder))
         entry: dict[str, Any] = {"file_path": relative.as_posix()}
         if not shared:
             entry |= _intrinsics(frame.camera)

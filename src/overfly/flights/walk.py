@@ -64,9 +64,9 @@ def random_walk(
     )
 
 
-def _standing(site: Site, middles: Array, yaw: float, tilt: float) -> Array:
+def _standing(site: Site, middles: Array, yaw: float, tilt: float, ahead: float | None = None) -> Array:
     """Poses [n, 4, 4] whose footprints have their middles at ``middles`` [n, 2] on level ground."""
-    ahead = site.frame_size(tilt)[2]
+    ahead = site.frame_size(tilt)[2] if ahead is None else ahead
     toward = np.array([math.sin(math.radians(yaw)), math.cos(math.radians(yaw))])
     xy = np.atleast_2d(middles) - ahead * toward
     return site.poses(xy, yaw, tilt)
@@ -89,7 +89,7 @@ def _next_frame(
     on_plane = footprints(site.camera, last[None], lambda xy: np.full(len(xy), plane), (plane, plane))
 
     def overlaps(distances: Array, yaw: float, tilt: float, level: bool) -> Array:
-        poses = _standing(site, middle + distances[:, None] * toward, yaw, tilt)
+        poses = _standing(site, middle + distances[:, None] * toward, yaw, tilt, ahead)
         if level:
             outlines = footprints(site.camera, poses, lambda xy: np.full(len(xy), plane), (plane, plane))
             return pair_overlap(np.broadcast_to(on_plane, outlines.shape), outlines)
@@ -99,6 +99,7 @@ def _next_frame(
     share = 1.0
     for _ in range(10):
         yaw, tilt = (old[0] + share * change[0]) % 360, old[1] + share * (change[1] - old[1])
+        ahead = site.frame_size(tilt)[2]
         if overlaps(np.zeros(1), yaw, tilt, True)[0] > min(overlap + 0.03, 0.5 + overlap / 2):
             break
         share /= 2
@@ -113,7 +114,7 @@ def _next_frame(
         distance = spacing_for(lambda d: float(overlaps(np.array([d]), yaw, tilt, False)[0]), level, overlap)
     except InputError:
         return None  # another direction or heading may do
-    pose = _standing(site, middle + distance * toward, yaw, tilt)[0]
+    pose = _standing(site, middle + distance * toward, yaw, tilt, ahead)[0]
     return pose, middle + distance * toward, (yaw, tilt)
 
 

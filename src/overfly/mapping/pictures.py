@@ -58,7 +58,7 @@ def overview(cloud: Cloud, *, pixels: int = 900, min_cell: float = 0.0) -> Surfa
     x_min, x_max, y_min, y_max = spread.extent
     side = max(x_max - x_min, y_max - y_min)
     coarse = grid_over(cloud.points, side / 60, trim=0.002)
-    covered = np.unique(coarse.cells(cloud.points)).size * coarse.cell**2
+    covered = coarse.hit(cloud.points) * coarse.cell**2
     sparse = float(np.sqrt(1.5 * covered / len(cloud)))
     cell = max(side / pixels, min_cell, min(sparse, side / 40))
     return surface(cloud, grid_over(cloud.points, cell, trim=0.002), fill=2)
@@ -90,18 +90,20 @@ def height_map(seen: Surface, *, offset: float = 0.0, unit: str = "m", width_in:
     """Heights (plus ``offset``) in colour over a hillshade, with colour bar, scale bar and north arrow."""
     from matplotlib import colormaps
     from matplotlib.colors import Normalize
+    from matplotlib.ticker import ScalarFormatter
 
     figure, axes = _map_figure(seen.grid, width_in)
     values = seen.heights[seen.filled]
     low, high = (float(v) for v in np.percentile(values, [0.5, 99.5])) if values.size else (0.0, 1.0)
-    high = max(high, low + 1e-6)
+    high = max(high, low + 4 * seen.grid.cell)  # flat ground is one colour, not a rainbow of noise
     norm, colours = Normalize(low, high), colormaps["turbo"]
     shaded = colours(norm(np.nan_to_num(seen.heights, nan=low)))[..., :3]
     shaded = shaded * (0.35 + 0.65 * np.minimum(hillshade(seen) / 0.72, 1.2))[..., None]
     shaded = np.where(seen.filled[..., None], np.clip(shaded, 0, 1), 1.0)
     axes.imshow(shaded, extent=seen.grid.extent, interpolation="nearest")
     norm = Normalize(low + offset, high + offset)
-    bar = figure.colorbar(_mappable(norm, colours), ax=axes, shrink=0.8, pad=0.02, aspect=30)
+    plain = ScalarFormatter(useOffset=False)
+    bar = figure.colorbar(_mappable(norm, colours), ax=axes, shrink=0.8, pad=0.02, aspect=30, format=plain)
     bar.set_label(f"height ({unit})", color=INK)
     bar.outline.set_visible(False)
     _furnish(axes, seen.grid, unit)

@@ -51,15 +51,16 @@ def raster_products(cloud: Cloud, out: Path, *, gsd: float, fill: int = 2) -> Su
 
 def cell_size(cloud: Cloud, gsd: float) -> float:
     """Twice the GSD, or as much more as it takes for three points in a filled cell on average."""
-    cell = 2 * gsd
+    spread = grid_over(cloud.points, 16 * gsd, trim=0.0005)
+    if spread.rows * spread.columns > MAX_CELLS:
+        return 2 * gsd
+    covered = spread.hit(cloud.points) * spread.cell**2
+    cell = max(2 * gsd, 0.5 * float(np.sqrt(3 * covered / len(cloud))))  # a first guess from below saves passes
     while True:
         grid = grid_over(cloud.points, cell, trim=0.0005)
         if grid.rows * grid.columns > MAX_CELLS:
             return cell
-        hit = np.zeros(grid.rows * grid.columns, bool)
-        cells = grid.cells(cloud.points)
-        hit[cells[cells >= 0]] = True
-        if 3 * np.count_nonzero(hit) <= len(cloud) or np.count_nonzero(hit) == 1:
+        if 3 * (hit := grid.hit(cloud.points)) <= len(cloud) or hit == 1:
             return cell
         cell *= 1.25
 

@@ -47,6 +47,12 @@ class Grid:
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         return np.where(inside, row * self.columns + column, -1)
 
+    def hit(self, points: ArrayLike) -> int:
+        """Number of cells that hold at least one of the points [N, >=2]."""
+        marks = np.zeros(self.rows * self.columns + 1, bool)
+        marks[self.cells(points)] = True  # -1, outside, marks the spare last one
+        return int(np.count_nonzero(marks[:-1]))
+
     def centres(self) -> NDArray[np.float64]:
         """x, y of all cell centres [rows, columns, 2]."""
         x = self.x_min + (np.arange(self.columns) + 0.5) * self.cell
@@ -63,7 +69,10 @@ def grid_over(points: ArrayLike, cell: float, *, trim: float = 0.0) -> Grid:
         trim: share of the points left out on each side (0.001 keeps single stray points from blowing it up).
     """
     xy = np.asarray(points)[:, :2]
-    low, high = (np.quantile(xy, [trim, 1 - trim], axis=0) if trim else (xy.min(0), xy.max(0))).__iter__()
+    if trim:
+        low, high = np.quantile(xy[:: len(xy) // 500_000 + 1], [trim, 1 - trim], axis=0)  # a sample is enough
+    else:
+        low, high = xy.min(0), xy.max(0)
     x_min, y_max = np.floor(low[0] / cell) * cell, (np.floor(high[1] / cell) + 1) * cell
     columns, rows = int(np.floor((high[0] - x_min) / cell)) + 1, int(np.ceil((y_max - low[1]) / cell))
     return Grid(float(x_min), float(y_max), float(cell), max(rows, 1), max(columns, 1))
@@ -78,7 +87,7 @@ class Surface:
         heights: [rows, columns] float64, NaN where empty.
         colors: [rows, columns, 3] uint8, or None.
         counts: [rows, columns] points of the upper layer; 0 where empty or filled.
-        views, predicted: [rows, columns] median-like mean number of views, share of predicted points; NaN where empty.
+        views, predicted: [rows, columns] mean number of views, share of predicted points; NaN where empty.
     """
 
     grid: Grid
@@ -118,20 +127,24 @@ def surface(cloud: Cloud, grid: Grid, *, fill: int = 0) -> Surface:
         with np.errstate(invalid="ignore"):
             return np.asarray(total / counts).reshape(grid.rows, grid.columns)
 
-    layers = [mean(cloud.points[:, 2])]
+    layers = {"heights": mean(cloud.points[:, 2])}
+    for name in ("views", "predicted"):
+        if (values := getattr(cloud, name)) is not None:
+            layers[name] = mean(values)
     if cloud.colors is not None:
-        layers += [mean(cloud.colors[:, channel]) for channel in range(3)]
-    stack = _fill(np.stack(layers, axis=-1), fill)
+        layers |= {name: mean(cloud.colors[:, channel]) for channel, name in enumerate("rgb")}
+    closed = _fill(np.stack(list(layers.values()), axis=-1), fill)
+    made = dict(zip(layers, np.moveaxis(closed, -1, 0), strict=True))
     colors = None
     if cloud.colors is not None:
-        colors = np.nan_to_num(stack[..., 1:]).round().astype(np.uint8)
+        colors = np.nan_to_num(np.stack([made[name] for name in "rgb"], axis=-1)).round().astype(np.uint8)
     return Surface(
         grid,
-        stack[..., 0],
+        made["heights"],
         colors,
         counts.reshape(grid.rows, grid.columns),
-        None if cloud.views is None else mean(cloud.views),
-        None if cloud.predicted is None else mean(cloud.predicted),
+        made.get("views"),
+        made.get("predicted"),
     )
 
 

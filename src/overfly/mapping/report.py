@@ -132,7 +132,7 @@ def verdict(summary: Mapping[str, Any]) -> str:
 def _tiles(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
     all_placed = summary["registered"] == summary["images"]
     mapped = area_text(summary["area"]) if summary["metric"] else "unknown"
-    density = f"{summary['points_per_area']:,.0f}".replace(",", " ")
+    density = density_text(summary["points_per_area"])
     low, high = summary["height_range"]
     measured = summary["measured"] / max(summary["points"], 1)
     tiles = [
@@ -178,7 +178,8 @@ def _accuracy(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
         )
     )
     if summary["metric"]:
-        how = "from the GPS of the images" if summary.get("gps_rms") else "as given with the cameras"
+        estimated = summary["cameras_from"] == "estimated"
+        how = "from the GPS of the images" if estimated else f"as given by {summary['cameras_from']}"
         rows.append(("Metric scale", "known", how))
     else:
         rows.append(("Metric scale", "unknown", "no GPS, no origin: measure a known distance and scale by it"))
@@ -217,6 +218,11 @@ def count_text(number: int) -> str:
     if number >= 1_000_000:
         return f"{number / 1e6:.2f} million"
     return f"{number:,}".replace(",", " ")
+
+
+def density_text(density: float) -> str:
+    """Two digits below ten, whole numbers above."""
+    return f"{density:.2g}" if density < 10 else f"{density:,.0f}".replace(",", " ")
 
 
 def length_text(metres: float) -> str:

@@ -26,7 +26,7 @@ MODES = ("none", "shift", "rigid", "similarity")
 TURNS_DEG = (-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0)
 """Headings from which ``rigid`` and ``similarity`` start."""
 
-COARSE_POINTS, FINE_POINTS = 6_000, 80_000
+COARSE_POINTS, SCALE_POINTS, FINE_POINTS = 6_000, 20_000, 80_000
 
 
 def align(cloud: Any, reference: Any, mode: str) -> tuple[Array, Array]:
@@ -70,8 +70,35 @@ def _align(points: Array, target: Array, mode: str) -> Array:
         found = starts(transform(turned, points), target)
         tried += [coarse.refine(start @ turned, "shift", 15) for start in found]
     promising = sorted(tried, key=coarse.misfit)[:3]
-    best = min((coarse.refine(start, mode, 100) for start in promising), key=coarse.misfit)
-    return Pair.thinned(points, target, FINE_POINTS).refine(best, mode, 40)
+    rigid = "shift" if mode == "shift" else "rigid"
+    best = min((coarse.refine(start, rigid, 100) for start in promising), key=coarse.misfit)
+    fine = Pair.thinned(points, target, FINE_POINTS)
+    if mode != "similarity":
+        return fine.refine(best, mode, 40)
+    return _scaled(Pair.thinned(points, target, SCALE_POINTS), fine, best)
+
+
+def _scaled(middle: Pair, fine: Pair, rigid: Array) -> Array:
+    """The similarity of the smallest misfit, from a rigid start.
+
+    Planes hold the scale of a flat, noisy cloud badly: every shrinking makes its noise smaller (a sparse cloud of a park
+    ended at 0.94). The distances from the reference back to the cloud hold it, so they judge: between the free fit, and
+    the minimum of a parabola through the misfits of fixed scales about the better one.
+    """
+    tried = [fine.refine(rigid, "rigid", 40), fine.refine(middle.refine(rigid, "similarity", 60), "similarity", 40)]
+    best = min(tried, key=fine.misfit)
+    centre = transform(best, middle.points).mean(0)
+
+    def at_scale(factor: float) -> Array:
+        fixed = np.eye(4) * [factor, factor, factor, 1]
+        fixed[:3, 3] = centre * (1 - factor)
+        return middle.refine(fixed @ best, "rigid", 15)
+
+    factors = np.linspace(0.97, 1.03, 7)
+    curve = np.polyfit(factors - 1, [middle.misfit(at_scale(factor)) for factor in factors], 2)
+    if curve[0] > 0 and abs(lowest := -curve[1] / (2 * curve[0])) < 0.03:
+        tried.append(fine.refine(at_scale(1 + lowest), "rigid", 40))
+    return min(tried, key=fine.misfit)
 
 
 def starts(points: Array, target: Array) -> list[Array]:

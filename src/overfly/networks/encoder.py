@@ -20,6 +20,9 @@ STRIDE = 16
 MATCH_STRIDE = 2
 """Pixels of the image to one cell of the match map."""
 
+CORRECTION_SIZE = 0.02
+"""Usual size of a correction, in radians and window units: 1 degree, or 1 m at 60 m per unit."""
+
 
 class Encoded(NamedTuple):
     """What the encoder knows about M images.
@@ -96,7 +99,7 @@ class Encoder(Part):
         last = nn.Linear(correction_width, 6)
         self.correction_head = nn.Sequential(nn.Linear(2 * pooled + 12, correction_width), nn.PReLU(), last)
         with torch.no_grad():  # no correction is the best first guess
-            last.weight.mul_(0.01)
+            last.weight.mul_(0.1)
             last.bias.zero_()
 
     def forward(self, images: Tensor) -> Encoded:
@@ -136,4 +139,4 @@ class Encoder(Part):
         prior = relative(prior_from_window)[:, 1:, :3].flatten(2)  # [B, K - 1, 12]
         reference = pooled[:, :1].expand_as(pooled[:, 1:])
         motions: Tensor = self.correction_head(torch.cat([pooled[:, 1:], reference, prior], -1))
-        return motions
+        return motions * CORRECTION_SIZE

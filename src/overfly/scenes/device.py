@@ -61,19 +61,26 @@ class DeviceScene:
         self.surface = self._upload(scene, faces, order)
 
     def _upload(self, scene: Scene, faces: NDArray, order: NDArray) -> Surface:
+        # Vertices in the order of the faces that use them: what a pixel needs lies together in memory.
+        used, first = np.unique(faces, return_index=True)
+        used = used[np.argsort(first)]
+        place = np.zeros(len(scene.vertices), np.int32)
+        place[used] = np.arange(len(used))
+        faces = place[faces]
+
         def put(array: NDArray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(array), dtype=dtype, device=self.device)
 
         s = Surface()
-        s.vertices = put(scene.vertices.astype(np.float32), wp.vec3)
-        s.faces = put(faces.astype(np.int32), wp.vec3i)
-        s.normals = put(scene.normals, wp.vec3)
+        s.vertices = put(scene.vertices[used].astype(np.float32), wp.vec3)
+        s.faces = put(faces, wp.vec3i)
+        s.normals = put(scene.normals[used], wp.vec3)
         s.material = put(scene.material[order], wp.int32)
         s.paint = put(scene.paint[order], wp.vec4)
         s.shape = put(scene.shape[order], wp.vec4)
-        colors = np.zeros((1, 3)) if scene.colors is None else _linear(scene.colors)
+        colors = np.zeros((1, 3)) if scene.colors is None else _linear(scene.colors[used])
         s.colors = put(colors.astype(np.float32), wp.vec3)
-        s.uv = put(np.zeros((1, 2), np.float32) if scene.uv is None else scene.uv.astype(np.float32), wp.vec2)
+        s.uv = put(np.zeros((1, 2), np.float32) if scene.uv is None else scene.uv[used].astype(np.float32), wp.vec2)
         texels, levels = _pyramid(np.zeros((1, 1, 3), np.uint8) if scene.texture is None else scene.texture)
         s.texels, s.levels = put(texels, wp.uint8), put(levels, wp.vec3i)
         g = GroundData()

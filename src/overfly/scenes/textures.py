@@ -53,17 +53,16 @@ def fractal(x: float, y: float, seed: int, wave: float, octaves: int, gain: floa
     """Octaves of noise from wavelength ``wave`` (metres) down, each turned and weaker by ``gain``."""
     total = float(0.0)
     strength = float(1.0)
-    size = float(wave)
-    px = float(x)
-    py = float(y)
+    resolved = 0.7 * wave / foot
+    px = x / wave
+    py = y / wave
     for i in range(octaves):
-        fade = wp.clamp(size / foot * 0.7 - 1.0, 0.0, 1.0)
-        if fade > 0.0:
-            total += strength * fade * noise(px / size, py / size, seed + i)
+        if resolved > 1.0:
+            total += strength * wp.min(resolved - 1.0, 1.0) * noise(px, py, seed + i)
         strength *= gain
-        size *= 0.47
-        turned = 0.8 * px - 0.6 * py
-        py = 0.6 * px + 0.8 * py + 17.3
+        resolved *= 0.47
+        turned = 1.7021277 * px - 1.2765957 * py  # a turn by 37 degrees, and 1 / 0.47
+        py = 1.2765957 * px + 1.7021277 * py + 17.3
         px = turned
     return total
 
