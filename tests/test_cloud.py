@@ -144,7 +144,9 @@ def test_missing_and_unknown(cloud: Cloud, tmp_path: Path) -> None:
 
 
 def test_empty_and_nan(tmp_path: Path) -> None:
-    header = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
     (tmp_path / "a.ply").write_text(header.format(0))
     with pytest.raises(InputError, match="has no points"):
         read_cloud(tmp_path / "a.ply")

@@ -56,11 +56,11 @@ def test_players_by_hand() -> None:
     assert torch.allclose(losses.adversarial(logits), -torch.log(torch.tensor([0.5, 0.75])))
     assert torch.allclose(losses.adversarial_eq1(logits), torch.log(torch.tensor([0.5, 0.25])))
     undecided = losses.discriminator(torch.zeros(1), torch.zeros(1))
-    assert undecided.item() == pytest.approx(2 * math.log(2))
-    # The discriminator minimises the negative of Eq. 1; the generator's share of Eq. 1 is its second term.
+    assert undecided.item() == pytest.approx(math.log(2))
+    # The discriminator minimises half the negative of Eq. 1; the generator's share of Eq. 1 is its second term.
     real, generated = torch.tensor([0.3]), torch.tensor([-0.8])
     eq1 = torch.log(torch.sigmoid(real)) + torch.log(1 - torch.sigmoid(generated))
-    assert torch.allclose(losses.discriminator(real, generated), -eq1)
+    assert torch.allclose(losses.discriminator(real, generated), -eq1 / 2)
 
 
 def test_the_non_saturating_form_still_pushes_where_eq1_is_flat() -> None:

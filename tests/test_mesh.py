@@ -129,7 +129,9 @@ def test_bad_files(tmp_path: Path) -> None:
     write_mesh(Mesh(np.eye(3), np.array([[0, 1, 7]], np.int32)), tmp_path / "c.ply")
     with pytest.raises(InputError, match="does not exist"):
         read_mesh(tmp_path / "c.ply")
-    write_mesh(Mesh(np.array([[0, 0, 0], [1, 0, np.nan], [0, 1, 0]]), np.array([[0, 1, 2]], np.int32)), tmp_path / "d.ply")
+    write_mesh(
+        Mesh(np.array([[0, 0, 0], [1, 0, np.nan], [0, 1, 0]]), np.array([[0, 1, 2]], np.int32)), tmp_path / "d.ply"
+    )
     with pytest.raises(InputError, match="1 of the 3 vertices"):
         read_mesh(tmp_path / "d.ply")
     with pytest.raises(InputError, match="without area"):

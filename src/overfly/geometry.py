@@ -98,13 +98,42 @@ def distort(normalised: ArrayLike, camera: Camera) -> Array:
     )
 
 
+def fold(camera: Camera) -> float:
+    """Squared radius, in ideal image coordinates, at which the radial lens formula turns back; inf if it never does.
+
+    Beyond it the formula means nothing: it throws points from far outside the field of view back into the image.
+    """
+    roots = np.roots([7 * camera.k3, 5 * camera.k2, 3 * camera.k1, 1.0])
+    real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+    return float(real.min()) if real.size else np.inf
+
+
 def undistort(distorted: ArrayLike, camera: Camera, iterations: int = 20) -> Array:
-    """Invert :func:`distort` by fixed-point iteration [N, 2]."""
+    """Invert :func:`distort` by Newton's method [N, 2], to about 1e-12 within three to six steps for usual lenses.
+
+    NaN where the lens formula has no inverse: beyond the radius at which a strong barrel folds back.
+    (Fixed-point iteration is simpler, but leaves 1e-4 px at the corners of a strong barrel after 20 steps.)
+    """
     target = np.asarray(distorted, float)
     points = target.copy()
     for _ in range(iterations):
-        points = points - (distort(points, camera) - target)
-    return points
+        x, y = points[..., 0], points[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
+        slope = 2 * (camera.k1 + r2 * (2 * camera.k2 + r2 * 3 * camera.k3))  # d radial / d x = slope x
+        xx = radial + slope * x * x + 2 * camera.p1 * y + 6 * camera.p2 * x
+        yy = radial + slope * y * y + 6 * camera.p1 * y + 2 * camera.p2 * x
+        xy = slope * x * y + 2 * camera.p1 * x + 2 * camera.p2 * y  # the Jacobian is symmetric
+        miss_x, miss_y = np.moveaxis(distort(points, camera) - target, -1, 0)
+        determinant = xx * yy - xy * xy
+        step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - xy * miss_x], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.clip(step / determinant[..., None], -1, 1)
+        points = points - step
+        if not np.any(np.abs(step) > 1e-12):
+            break
+    solved = np.abs(distort(points, camera) - target).max(-1) < 1e-7
+    return np.where((solved & ((points**2).sum(-1) < fold(camera)))[..., None], points, np.nan)
 
 
 def project(points: ArrayLike, camera: Camera, world_from_camera: ArrayLike) -> tuple[Array, Array]:
@@ -116,14 +145,15 @@ def project(points: ArrayLike, camera: Camera, world_from_camera: ArrayLike) -> 
         world_from_camera: [4, 4].
 
     Returns:
-        Pixels [..., 2] (NaN behind the camera) and depth [...], metres.
+        Pixels [..., 2] (NaN behind the camera and where the lens formula folds) and depth [...], metres.
     """
     local = transform(invert(world_from_camera), points)
     depth = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         normalised = np.where(depth[..., None] > 0, local[..., :2] / depth[..., None], np.nan)
     if camera.is_distorted:
-        normalised = distort(normalised, camera)
+        inside = (normalised**2).sum(-1, keepdims=True) < fold(camera)
+        normalised = np.where(inside, distort(normalised, camera), np.nan)
     return normalised * [camera.fx, camera.fy] + [camera.cx, camera.cy], depth
 
 
@@ -282,12 +312,13 @@ def utm_epsg(latitude: float, longitude: float) -> int:
 
 
 @lru_cache(maxsize=64)
-def _topocentric(latitude: float, longitude: float, height: float):  # type: ignore[no-untyped-def]
+def _topocentric(latitude: float, longitude: float, height: float):
     from pyproj import Transformer
 
     return Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-        f"+step +proj=topocentric +ellps=WGS84 +lat_0={float(latitude)!r} +lon_0={float(longitude)!r} +h_0={float(height)!r}"
+        f"+step +proj=topocentric +ellps=WGS84 +lat_0={float(latitude)!r} +lon_0={float(longitude)!r} "
+        f"+h_0={float(height)!r}"
     )
 
 
@@ -307,7 +338,7 @@ def geodetic_from_enu(points: ArrayLike, origin: Origin) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _projected(epsg: int):  # type: ignore[no-untyped-def]
+def _projected(epsg: int):
     from pyproj import Transformer
 
     return Transformer.from_crs("EPSG:4979", f"EPSG:{epsg}", always_xy=True)

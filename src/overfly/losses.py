@@ -138,11 +138,11 @@ def adversarial_eq1(generated: Tensor) -> Tensor:
 
 
 def discriminator(real: Tensor, generated: Tensor) -> Tensor:
-    """What the discriminator minimises, the negative of Eq. 1: -log D(real) - log(1 - D(G)), from logits [B] -> [B].
+    """What the discriminator minimises, half the negative of Eq. 1, from logits [B] -> [B].
 
-    2 log 2 = 1.386 for one that cannot tell them apart.
+    (-log D(real) - log(1 - D(G))) / 2 is its cross-entropy per cloud; log 2 = 0.693 if it cannot tell them apart.
     """
-    return torch.nn.functional.softplus(-real) + torch.nn.functional.softplus(generated)
+    return (torch.nn.functional.softplus(-real) + torch.nn.functional.softplus(generated)) / 2
 
 
 def _check(predicted: Tensor, target: Tensor) -> None:

@@ -16,7 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
-from overfly.cloud import read_cloud
+from overfly.cloud import Cloud, read_cloud
 from overfly.errors import InputError
 from overfly.geometry import (
     OPENCV_FROM_OPENGL,
@@ -27,6 +27,7 @@ from overfly.geometry import (
     pixel_grid,
     pose,
     rotation_from_gimbal,
+    transform,
 )
 from overfly.mapping.map import map_flight
 from overfly.mapping.settings import MapSettings
@@ -297,3 +298,32 @@ def test_images_of_mixed_size_are_mapped(tmp_path: Path) -> None:
     data["frames"][1] |= {"fl_x": small.fx, "fl_y": small.fy, "cx": small.cx, "cy": small.cy, "w": 80, "h": 60}
     (flight / "transforms.json").write_text(json.dumps(data))
     assert mapped(flight, tmp_path / "out")["registered"] == 4
+
+
+def test_a_frame_whose_z_is_not_up_gets_no_rasters_and_keeps_its_cloud(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "f")
+    data = json.loads((flight / "transforms.json").read_text())
+    turn = pose(rotation_from_gimbal(40, -10, 30), [0, 0, 0])
+    from overfly.flights import read_flight
+    from overfly.mapping.block import given_block
+    from overfly.mapping.deliver import deliver
+    from overfly.mapping.steps import Steps
+
+    upright_block = given_block(read_flight(flight))
+    for frame in data["frames"]:
+        frame["transform_matrix"] = (turn @ np.array(frame["transform_matrix"])).tolist()
+    (flight / "transforms.json").write_text(json.dumps(data))
+    lying = read_flight(flight)
+    x, y = np.meshgrid(np.linspace(-30, 30, 60), np.linspace(-40, 40, 60))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, GROUND)])
+    cloud = Cloud(transform(turn, ground), np.full((x.size, 3), 99, np.uint8))
+    steps = Steps(tmp_path / "work", resume=True, show=False)
+    out = tmp_path / "out"
+    out.mkdir()
+    summary = deliver(lying, given_block(lying), cloud, out, MapSettings(dense="stereo"), steps)
+    assert not (out / "dsm.tif").exists()
+    assert "does not point up" in summary["warnings"][0]
+    np.testing.assert_allclose(read_cloud(out / "cloud.laz").points, cloud.points, atol=1e-3)
+    assert summary["gsd_m"] == pytest.approx(55 / 80, rel=0.02)
+    deliver(lying, upright_block, Cloud(ground), out, MapSettings(dense="stereo"), steps)
+    assert (out / "dsm.tif").exists()

@@ -97,17 +97,25 @@ def test_gallery_has_every_picture_and_counts_views() -> None:
     assert row[columns // 2] == 2
 
 
-def test_an_unknown_up_is_found_from_the_cameras() -> None:
-    cloud = town(2000)
-    poses = np.stack([pose(rotation_from_gimbal(30, -80), [x, 40.0, 50.0]) for x in (20.0, 80.0)])
-    turn = np.eye(4)
-    turn[:3, :3] = rotation_from_gimbal(77, -20, 140)
-    lying = cloud.with_points(cloud.points @ turn[:3, :3].T)
-    stood, cameras = upright(lying, turn @ poses)
-    assert (cameras[:, 2, 3] - stood.points[:, 2].mean() > 30).all()
-    assert np.ptp(np.percentile(stood.points[:, 2], [1, 60])) < 30
-    grown = np.linalg.norm(stood.points[0] - stood.points[1]) - np.linalg.norm(cloud.points[0] - cloud.points[1])
-    assert abs(grown) < 1e-9
+@pytest.mark.parametrize(
+    "gimbals",
+    [
+        [(30, -80), (210, -80), (30, -85)],  # strips there and back
+        [(90, -45), (90, -45), (270, -45), (180, -45)],  # oblique
+        [(yaw, -10) for yaw in range(0, 360, 45)],  # round a tower, to the horizon
+        [(12, -88), (12, -88)],  # one strip
+    ],
+)
+def test_an_unknown_up_is_found_from_the_cameras(gimbals: list[tuple[float, float]]) -> None:
+    poses = np.stack([pose(rotation_from_gimbal(yaw, pitch), [yaw, 40.0, 50.0]) for yaw, pitch in gimbals])
+    turned = np.eye(4)
+    turned[:3, :3] = rotation_from_gimbal(77, -20, 140)
+    for frame in (np.eye(4), turned):
+        turn = upright(frame @ poses)
+        np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(turn[:3, :3]) > 0
+        up = turn[:3, :3] @ frame[:3, 2]  # where true up goes
+        assert up[2] > np.cos(np.radians(3))
 
 
 def test_nice_lengths_and_files() -> None:

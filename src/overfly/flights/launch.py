@@ -227,7 +227,7 @@ def _claim(out: Path, key: str) -> None:
         if old == key:
             return
         raise InputError(f"{out} holds another flight: give another folder, or delete this one first.")
-    if out.is_dir() and any(out.iterdir()):
+    if out.is_dir() and any(not p.name.startswith(".fly.json.") for p in out.iterdir()):
         raise InputError(f"{out} is not empty and holds no flight of this command: give another folder.")
     with replacing(record) as temporary:
         temporary.write_text(json.dumps({"key": key}) + "\n", encoding="utf-8")

@@ -74,7 +74,8 @@ def render_frames(
     """Render the frames that are not there yet."""
     folder = out / "images"
     folder.mkdir(exist_ok=True)
-    remove_leftovers(folder)
+    for place in (out, folder):
+        remove_leftovers(place)
     paths = [folder / frame_name(i) for i in range(len(plan))]
     todo = [i for i, path in enumerate(paths) if not path.is_file() or defect(path) is not None]
     options = (supersample, quality, seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -147,9 +146,10 @@ def frame_name(index: int) -> str:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete the temporary folders that a killed process left behind."""
-    for rest in folder.glob(".frame_*.jpg.*"):
-        if rest.is_dir():
-            for file in rest.iterdir():
-                file.unlink()
-            os.rmdir(rest)
+    """Delete the temporary folders that a killed process left behind in a flight folder or its images."""
+    for kind in ("frame_*.jpg", "reference.laz", "transforms.json", "fly.json"):
+        for rest in folder.glob(f".{kind}.*"):
+            if rest.is_dir():
+                for file in rest.iterdir():
+                    file.unlink()
+                rest.rmdir()

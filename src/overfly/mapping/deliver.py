@@ -12,16 +12,20 @@ from overfly import __version__
 from overfly.cloud import Cloud, write_cloud
 from overfly.errors import InputError
 from overfly.files import replacing
-from overfly.flights import Flight, write_transforms
-from overfly.geometry import crs_from_enu
+from overfly.flights import Flight, Frame, write_transforms
+from overfly.geometry import crs_from_enu, transform
 from overfly.mapping.block import Block
 from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
-from overfly.mapping.gallery import gallery
+from overfly.mapping.gallery import gallery, upright
 from overfly.mapping.products import raster_products
-from overfly.mapping.report import duration, write_report
+from overfly.mapping.raster import Surface
+from overfly.mapping.report import Caution, duration, write_report
 from overfly.mapping.settings import MapSettings
 from overfly.mapping.steps import Steps, peak_memory_mb
+
+LEVEL = 0.5
+"""Cosine of the largest angle between up, as the cameras tell it, and the frame's z axis."""
 
 
 def deliver(flight: Flight, block: Block, local: Cloud, out: Path, asked: MapSettings, steps: Steps) -> dict[str, Any]:
@@ -41,66 +45,36 @@ def deliver(flight: Flight, block: Block, local: Cloud, out: Path, asked: MapSet
     if len(local) == 0:
         raise InputError("No point could be measured: the images overlap too little or show too little texture.")
     gsd = ground_sampling(local, block.cameras, block.poses)
-    epsg = None
-    placed = local
-    if block.origin is not None and block.metric:
-        epsg = block.origin.crs_epsg
-        placed = local.with_points(crs_from_enu(local.points, block.origin), epsg)
+    placed = georeferenced(local, block)
+    turn = upright(block.poses)
+    level = bool(turn[2, 2] > LEVEL)
+    turn = np.eye(4) if level else turn
+    written = ["cloud.laz", *(["cloud.ply"] if asked.ply else [])]
     with steps.timed("products"):
-        written = ["cloud.laz", *(["cloud.ply"] if asked.ply else [])]
         for name in written:
             write_cloud(placed, out / name)
         facts = {} if block.metric else {"scale": "unknown"}
         write_transforms(out / "transforms.json", block.frames, block.origin, facts)
-        raster_products(placed, out, gsd=gsd)
-        written += ["dsm.tif", "orthophoto.tif", "transforms.json", "map.json"]
+        for name in ("dsm.tif", "orthophoto.tif"):
+            (out / name).unlink(missing_ok=True)
+        if level:
+            raster_products(placed, out, gsd=gsd)
+            written += ["dsm.tif", "orthophoto.tif"]
+        written += ["transforms.json", "map.json"]
     steps.say("products", ", ".join(written[:-1]))
     with steps.timed("report"):
-        lost = [f for f in flight.frames if f.name not in set(block.names)]
-        told = block.gps_positions(lost)
         shown, seen = gallery(
-            local,
+            local.with_points(transform(turn, local.points)),
             block.cameras,
-            block.poses,
+            turn @ block.poses,
             block.names,
             gsd=gsd,
             unit="m" if block.metric else "units",
             height_offset=float(np.median(placed.points[:, 2] - local.points[:, 2])),
-            missing=[(name, position) for name, position in told.items()],
+            missing=list(block.gps_positions(lost_frames(flight, block)).items()),
         )
-    counted = cloud_facts(placed, seen, gsd)
-    summary: dict[str, Any] = {
-        "images": len(flight) + len(flight.skipped),
-        "registered": len(block.frames),
-        "points": counted["points"],
-        "measured": counted["measured"],
-        "predicted": counted["predicted"],
-        "gsd_m": round(gsd, 5) if block.metric else None,
-        "crs": None if epsg is None else f"EPSG:{epsg}",
-        "cameras_from": block.cameras_from,
-        "seconds": steps.seconds,
-        "peak_memory_mb": round(peak_memory_mb(), 1),
-        "warnings": [],
-        "metric": block.metric,
-        "reprojection_px": block.reprojection_px,
-        "gps_rms": block.gps_rms(),
-        "unregistered": [f.name for f in lost],
-        "skipped": dict(flight.skipped),
-        **{k: counted[k] for k in ("area", "points_per_area", "height_range", "median_sigma", "seen_once_share")},
-        "reused": steps.reused,
-        "settings": asked.shown(),
-        "version": __version__,
-    }
-    altitudes = {}
-    if block.metric:
-        above = heights_above_ground(seen, block.poses)
-        altitudes = {f.name: (float(h), f.relative_altitude) for f, h in zip(block.frames, above, strict=True)}
-    found = cautions(
-        summary,
-        altitudes=altitudes,
-        has_gps=any(f.gps is not None for f in flight.frames),
-        from_readers=[*flight.warnings, *block.warnings],
-    )
+    summary = summarise(flight, block, placed, seen, gsd, asked, steps)
+    found = _cautions(flight, block, seen, summary, level)
     summary["warnings"] = [str(c).strip() for c in found]
     with steps.timed("report"):
         write_report(
@@ -118,3 +92,68 @@ def deliver(flight: Flight, block: Block, local: Cloud, out: Path, asked: MapSet
         steps.say("warning", line)
     steps.say("done", f"{out / 'report.html'} after {duration(sum(steps.seconds.values()))}")
     return summary
+
+
+def georeferenced(local: Cloud, block: Block) -> Cloud:
+    """The cloud in the block's projected CRS; unchanged where the block has no place on the Earth."""
+    if block.origin is None or not block.metric:
+        return local
+    return local.with_points(crs_from_enu(local.points, block.origin), block.origin.crs_epsg)
+
+
+def lost_frames(flight: Flight, block: Block) -> list[Frame]:
+    """Frames that the block could not place."""
+    names = set(block.names)
+    return [frame for frame in flight.frames if frame.name not in names]
+
+
+def summarise(
+    flight: Flight, block: Block, placed: Cloud, seen: Surface, gsd: float, asked: MapSettings, steps: Steps
+) -> dict[str, Any]:
+    """The content of ``map.json``, its warnings still empty."""
+    counted = cloud_facts(placed, seen, gsd)
+    return {
+        "images": len(flight) + len(flight.skipped),
+        "registered": len(block.frames),
+        "points": counted["points"],
+        "measured": counted["measured"],
+        "predicted": counted["predicted"],
+        "gsd_m": round(gsd, 5) if block.metric else None,
+        "crs": None if placed.epsg is None else f"EPSG:{placed.epsg}",
+        "cameras_from": block.cameras_from,
+        "seconds": steps.seconds,
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "warnings": [],
+        "metric": block.metric,
+        "reprojection_px": block.reprojection_px,
+        "gps_rms": block.gps_rms(),
+        "unregistered": [frame.name for frame in lost_frames(flight, block)],
+        "skipped": dict(flight.skipped),
+        **{k: counted[k] for k in ("area", "points_per_area", "height_range", "median_sigma", "seen_once_share")},
+        "reused": steps.reused,
+        "settings": asked.shown(),
+        "version": __version__,
+    }
+
+
+def _cautions(flight: Flight, block: Block, seen: Surface, summary: dict[str, Any], level: bool) -> list[Caution]:
+    altitudes = {}
+    if block.metric and level:
+        above = heights_above_ground(seen, block.poses)
+        altitudes = {f.name: (float(h), f.relative_altitude) for f, h in zip(block.frames, above, strict=True)}
+    found = cautions(
+        summary,
+        altitudes=altitudes,
+        has_gps=any(f.gps is not None for f in flight.frames),
+        from_readers=[*flight.warnings, *block.warnings],
+    )
+    if not level:
+        found.insert(
+            0,
+            Caution(
+                "The z axis of the cameras' frame does not point up, so there is no dsm.tif and no orthophoto.tif.",
+                "The pictures here are turned for reading, the cloud is not; give cameras in a frame with z up, "
+                "or map with --cameras estimate.",
+            ),
+        )
+    return found

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from overfly.cloud import Cloud
 from overfly.data.footprints import footprint, sees
-from overfly.geometry import Array, Camera, transform
+from overfly.geometry import Array, Camera
 from overfly.mapping import pictures
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Picture
@@ -19,21 +19,25 @@ SHOWN = 2_000_000
 """Points kept for the oblique picture: more would not be seen in it."""
 
 
-def upright(cloud: Cloud, poses: Array) -> tuple[Cloud, Array]:
-    """A cloud of unknown orientation turned so that up is up in pictures: against the mean viewing direction.
+def upright(poses: Array) -> Array:
+    """The rotation [4, 4] that puts up on the z axis, guessed from the cameras alone.
 
-    Only for pictures; the product stays in the cameras' frame.
+    Level cameras have their x axes in the horizontal plane, so up is the direction that is square to all of them; where
+    all fly in one direction, the one of these directions that is nearest to the way back along the line of sight.
     """
-    forward = np.mean(poses[:, :3, 2], axis=0)
-    up = -np.mean(poses[:, :3, 1], axis=0)
-    # Cameras that look down say up by their optical axis, those that look ahead by their vertical one.
-    z = -forward if np.linalg.norm(forward) > 0.6 else up
-    z = z / np.linalg.norm(z)
-    x = np.cross(np.array([0.0, 1, 0]) if abs(z[1]) < 0.9 else np.array([1.0, 0, 0]), z)
+    right, backward = poses[:, :3, 0], -poses[:, :3, 2].mean(0)
+    values, vectors = np.linalg.eigh(right.T @ right / len(right))  # ascending
+    z = vectors[:, 0]
+    if values[1] < 0.05:
+        free = vectors[:, :2]
+        z = free @ (free.T @ backward)
+    z = z * np.sign(z @ (backward - poses[:, :3, 1].mean(0))) / np.linalg.norm(z)
+    x = np.array([1.0, 0, 0]) if abs(z[0]) < 0.9 else np.array([0, 1.0, 0])
+    x = x - z * (x @ z)
     x /= np.linalg.norm(x)
     turn = np.eye(4)
     turn[:3, :3] = np.stack([x, np.cross(z, x), z])
-    return cloud.with_points(transform(turn, cloud.points)), turn @ poses
+    return turn
 
 
 def gallery(

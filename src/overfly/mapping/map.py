@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,14 @@ from overfly import __version__
 from overfly.cloud import Cloud
 from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
-from overfly.mapping.block import Block, given_block, keep_cloud, kept_cloud, read_block, write_block
+from overfly.mapping.block import Block, checked, given_block, keep_cloud, kept_cloud, read_block, write_block
 from overfly.mapping.deliver import deliver
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of
+
+FEWEST_POINTS = 30
+"""Sparse points that tell depth ranges and the ground; with fewer, the altitude is asked for."""
 
 
 def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> dict[str, Any]:
@@ -32,10 +36,12 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
     """
     asked = MapSettings(**settings)
     flight_folder, out = Path(flight_folder), Path(out)
+    start = time.perf_counter()
     flight = read_flight(flight_folder)
     identity = key_of(fingerprint([f.path for f in flight.frames]), _camera_files(flight_folder))
     work = claim(out, flight_folder, identity, overwrite=asked.overwrite)
     steps = Steps(work, resume=asked.resume, show=asked.progress)
+    steps.seconds["images"] = round(time.perf_counter() - start, 2)
     try:
         return _map(flight, identity, out, asked, steps)
     except KeyboardInterrupt:
@@ -64,7 +70,7 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
     key = key_of(key, asked.dense, network if asked.dense == "sweep" else None, asked.seed)
     make: Callable[[Path], Cloud] = {
         "sweep": lambda _: sweep_cloud(block, flight, asked, steps),
-        "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
+        "stereo": lambda scratch: stereo_cloud(block, flight, scratch, steps),
     }[asked.dense]
     local = steps.kept("dense", key, make, keep_cloud, kept_cloud)
     steps.say("dense", f"{count_text(len(local))} points by {_how(asked)}")
@@ -73,12 +79,24 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
 
 def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Block:
     """Cameras estimated from the images."""
-    raise NotImplementedError
+    from overfly.mapping.align import align
+
+    return checked(align(flight, workdir=scratch, seed=asked.seed, bar=steps.bar), flight)
 
 
-def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:
+def stereo_cloud(block: Block, flight: Flight, scratch: Path, steps: Steps) -> Cloud:
     """The dense cloud by semi-global matching, in the block's frame."""
-    raise NotImplementedError
+    from overfly.mapping.fuse import fuse
+    from overfly.mapping.stereo import choose_pairs, depth_maps, depth_ranges, ranges_over_ground
+
+    if block.points is not None and len(block.points) >= FEWEST_POINTS:
+        ranges = depth_ranges(block.frames, block.points)
+    else:
+        ranges = ranges_over_ground(block.frames, ground_height(block, flight))
+    pairing = choose_pairs(block.frames, ranges)
+    folder = scratch / "depth"
+    depth_maps(block.frames, ranges, pairing, folder=folder, bar=steps.bar)
+    return fuse(block.frames, pairing, folder=folder, bar=steps.bar)
 
 
 def sweep_cloud(block: Block, flight: Flight, asked: MapSettings, steps: Steps) -> Cloud:
@@ -110,7 +128,7 @@ def ground_height(block: Block, flight: Flight) -> float:
         InputError: neither is known.
     """
     heights = block.poses[:, 2, 3]
-    if block.points is not None and len(block.points) >= 10:
+    if block.points is not None and len(block.points) >= FEWEST_POINTS:
         return float(np.median(block.points[:, 2]))
     relative = [(z, f.relative_altitude) for z, f in zip(heights, block.frames, strict=True) if f.relative_altitude]
     if isinstance(altitude := flight.facts.get("altitude"), int | float) and altitude > 0:

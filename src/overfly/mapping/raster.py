@@ -111,7 +111,8 @@ def surface(cloud: Cloud, grid: Grid, *, fill: int = 0) -> Surface:
     Args:
         cloud: N points.
         grid: the cells.
-        fill: passes in which an empty cell with at least three filled neighbours of eight takes their mean.
+        fill: passes in which an empty cell with at least three filled neighbours of eight takes their mean; with any,
+            single cells that stand apart from all their neighbours in height count as empty.
     """
     cells, size = grid.cells(cloud.points), grid.rows * grid.columns
     inside = np.flatnonzero(cells >= 0)
@@ -133,7 +134,10 @@ def surface(cloud: Cloud, grid: Grid, *, fill: int = 0) -> Surface:
             layers[name] = mean(values)
     if cloud.colors is not None:
         layers |= {name: mean(cloud.colors[:, channel]) for channel, name in enumerate("rgb")}
-    closed = _fill(np.stack(list(layers.values()), axis=-1), fill)
+    stack = np.stack(list(layers.values()), axis=-1)
+    if fill:
+        stack[_speckles(layers["heights"], LAYER * grid.cell)] = np.nan
+    closed = _fill(stack, fill)
     made = dict(zip(layers, np.moveaxis(closed, -1, 0), strict=True))
     colors = None
     if cloud.colors is not None:
@@ -146,6 +150,21 @@ def surface(cloud: Cloud, grid: Grid, *, fill: int = 0) -> Surface:
         made.get("views"),
         made.get("predicted"),
     )
+
+
+def _speckles(heights: NDArray[np.float64], step: float) -> NDArray[np.bool_]:
+    """Cells that fewer than two of their eight neighbours join within ``step`` in height: stray matches, not ground."""
+    padded = np.pad(heights, 1, constant_values=np.nan)
+    rows, columns = heights.shape
+    joined = np.zeros(heights.shape, np.int8)
+    known = np.zeros(heights.shape, np.int8)
+    for down in range(3):
+        for right in range(3):
+            if (down, right) != (1, 1):
+                beside = padded[down : down + rows, right : right + columns]
+                joined += np.abs(beside - heights) <= step
+                known += np.isfinite(beside)
+    return (known >= 2) & (joined < 2)
 
 
 def _fill(layers: NDArray[np.float64], passes: int) -> NDArray[np.float64]:

@@ -128,7 +128,8 @@ class Steps:
             MofNCompleteColumn(),
             TimeRemainingColumn(),
         )
-        with Progress(*columns, console=self.console, transient=True, disable=self.console.quiet) as progress:
+        hidden = self.console.quiet or not self.console.is_terminal  # a log file wants lines, not bars
+        with Progress(*columns, console=self.console, transient=True, disable=hidden) as progress:
             task = progress.add_task(what, total=None)
 
             def update(done: int, total: int) -> None:

@@ -57,7 +57,10 @@ def refine(
         reluctance: correlation lost per pixel of offset, which keeps textureless ground where it was.
     """
     height, width = depth.shape
-    warps = [_warp(reference, shot, width, height) for shot in neighbours]
+    warps = [
+        frame_to_frame(reference.camera, reference.world_from_camera, shot.camera, shot.world_from_camera)
+        for shot in neighbours
+    ]
     inverse = np.where(np.isfinite(depth), 1 / depth, np.nan).astype(np.float32)
     middle = float(np.nanmedian(inverse))
     # pixels per unit of inverse depth
@@ -88,16 +91,21 @@ def refine(
     return Refined((1 / moved).astype(np.float32), score.astype(np.float32), (depth * depth * unit).astype(np.float32))
 
 
-def _warp(reference: Shot, shot: Shot, width: int, height: int) -> tuple[list[Map], Array]:
-    """q [3][H, W] and t [3] with neighbour pixel = (q + w t) / third for inverse depth w."""
-    relative = invert(shot.world_from_camera) @ reference.world_from_camera
-    matrix = shot.camera.matrix() @ relative[:3, :3] @ np.linalg.inv(reference.camera.matrix())
-    u, v = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
+def frame_to_frame(
+    camera: Camera, world_from_camera: Array, other: Camera, world_from_other: Array
+) -> tuple[list[Map], NDArray[np.float32]]:
+    """q [3][H, W] and t [3]: a pixel with inverse depth w is seen by the other frame at (q + w t) / (q + w t)[2].
+
+    (q + w t)[2] / w is its depth there. Both cameras are without distortion.
+    """
+    relative = invert(world_from_other) @ world_from_camera
+    matrix = other.matrix() @ relative[:3, :3] @ np.linalg.inv(camera.matrix())
+    u, v = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
     q = [(row[0] * u + row[1] * v + row[2]).astype(np.float32) for row in matrix]
-    return q, shot.camera.matrix() @ relative[:3, 3]
+    return q, (other.matrix() @ relative[:3, 3]).astype(np.float32)
 
 
-def _rate(warp: tuple[list[Map], Array], middle: float, width: int, height: int) -> float:
+def _rate(warp: tuple[list[Map], NDArray[np.float32]], middle: float, width: int, height: int) -> float:
     """Pixels that the middle of the frame moves in the neighbour per unit of inverse depth."""
     q, t = warp
     centre = np.array([m[height // 2, width // 2] for m in q], float)
@@ -115,7 +123,7 @@ def _moments(image: Map, window: int) -> tuple[Map, Map]:
 
 
 def _correlate(
-    gray: Map, mean: Map, spread: Map, shot: Shot, warp: tuple[list[Map], Array], trial: Map, window: int
+    gray: Map, mean: Map, spread: Map, shot: Shot, warp: tuple[list[Map], NDArray[np.float32]], trial: Map, window: int
 ) -> Map:
     """Zero-mean normalised correlation [H, W] of the frame and the neighbour warped by the inverse depth ``trial``."""
     import cv2

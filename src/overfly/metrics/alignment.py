@@ -68,10 +68,10 @@ def _align(points: Array, target: Array, mode: str) -> Array:
         turned[:3, :3] = Rotation.from_euler("z", turn, degrees=True).as_matrix()
         # The shift comes first in every mode: a rotation must not make up for a wrong start.
         found = starts(transform(turned, points), target)
-        tried += [coarse.refine(start @ turned, "shift", 15) for start in found]
+        tried += [coarse.refine(start @ turned, "shift", 10) for start in found]
     promising = sorted(tried, key=coarse.misfit)[:3]
     rigid = "shift" if mode == "shift" else "rigid"
-    best = min((coarse.refine(start, rigid, 100) for start in promising), key=coarse.misfit)
+    best = min((coarse.refine(start, rigid, 60) for start in promising), key=coarse.misfit)
     fine = Pair.thinned(points, target, FINE_POINTS)
     if mode != "similarity":
         return fine.refine(best, mode, 40)
@@ -81,9 +81,9 @@ def _align(points: Array, target: Array, mode: str) -> Array:
 def _scaled(middle: Pair, fine: Pair, rigid: Array) -> Array:
     """The similarity of the smallest misfit, from a rigid start.
 
-    Planes hold the scale of a flat, noisy cloud badly: every shrinking makes its noise smaller (a sparse cloud of a park
-    ended at 0.94). The distances from the reference back to the cloud hold it, so they judge: between the free fit, and
-    the minimum of a parabola through the misfits of fixed scales about the better one.
+    Planes hold the scale of a flat, noisy cloud badly: every shrinking makes its noise smaller (the sparse cloud of a
+    park ended at 0.94). The distances from the reference back to the cloud hold it, so they judge: between the free
+    fit, and the minimum of a parabola through the misfits of fixed scales about the better one.
     """
     tried = [fine.refine(rigid, "rigid", 40), fine.refine(middle.refine(rigid, "similarity", 60), "similarity", 40)]
     best = min(tried, key=fine.misfit)
@@ -111,8 +111,9 @@ def starts(points: Array, target: Array) -> list[Array]:
     if extent > 0:
         rough = _by_heights(points, target, first, extent / 32, 8)
         shifts += [_by_heights(points, target, start, extent / 128, 6) for start in (first, rough)]
-    matrices = np.tile(np.eye(4), (len(shifts), 1, 1))
-    matrices[:, :3, 3] = shifts
+    different = np.unique(np.round(shifts, 6), axis=0)  # both resolutions often agree
+    matrices = np.tile(np.eye(4), (len(different), 1, 1))
+    matrices[:, :3, 3] = different
     return list(matrices)
 
 

@@ -28,12 +28,12 @@ class CloudMetric(Metric):
     _last: ClassVar[tuple[list[Tensor], list[Distances]] | None] = None
 
     def __init__(self, key: str, **kwargs: Any) -> None:
-        """``key``: the name under which the value is logged; it carries the convention and the unit."""
+        """``key``: the name under which the value is logged; it carries the convention and the unit, and no dot."""
         super().__init__(**kwargs)
         self.key = key
         # The names of states hold the key: MetricCollection merges metrics whose states have equal names and, after
         # the first batch, equal values, as two F-scores of 0 would have.
-        self._names = f"{key}_total".replace(".", "_"), f"{key}_count".replace(".", "_")
+        self._names = f"{key}_total", f"{key}_count"
         for name in self._names:
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 

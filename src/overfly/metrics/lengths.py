@@ -17,7 +17,7 @@ class _Quantile(CloudMetric):
     def __init__(self, quantile: float = 0.5, **kwargs: Any) -> None:
         if not 0 <= quantile <= 1:
             raise InputError(f"The quantile {quantile} is none: give a number from 0 to 1, such as 0.9.")
-        label = "median" if quantile == 0.5 else f"p{quantile * 100:g}"
+        label = "median" if quantile == 0.5 else f"p{quantile * 100:g}".replace(".", "_")
         super().__init__(f"{self.name}_{label}_m", **kwargs)
         self.quantile = quantile
 

@@ -27,7 +27,7 @@ class _Share(CloudMetric):
     def __init__(self, threshold: float, *, unit: str = "m", **kwargs: Any) -> None:
         if unit not in UNITS or not threshold > 0:
             raise InputError(f"A threshold of {threshold} {unit} is none: give a number above 0 and the unit m or gsd.")
-        super().__init__(f"{self.name}_{threshold:g}{unit}", **kwargs)
+        super().__init__(f"{self.name}_{_label(threshold, unit)}", **kwargs)
         self.threshold, self.unit = threshold, unit
 
     def update(
@@ -46,6 +46,13 @@ class _Share(CloudMetric):
 
     def share(self, found: Distances, threshold_m: float) -> float:
         raise NotImplementedError
+
+
+def _label(threshold: float, unit: str) -> str:
+    """``1m``, ``25cm`` or ``2gsd``: without a dot, which names of modules must not have."""
+    if unit == "m" and threshold != round(threshold):
+        threshold, unit = threshold * 100, "cm"
+    return f"{threshold:g}".replace(".", "_") + unit
 
 
 class Precision(_Share):

@@ -31,7 +31,7 @@ class Builder:
         paint: ArrayLike,
         shape: ArrayLike = (0, 0, 0, 0),
     ) -> None:
-        """Indexed triangles: vertices, normals [V, 3], faces [F, 3]; material [F] or one; paint, shape [F, 4] or [4]."""
+        """Triangles: vertices, normals [V, 3], faces [F, 3]; material [F] or one; paint, shape [F, 4] or [4]."""
         if not len(faces):
             return
         self._vertices.append(vertices)

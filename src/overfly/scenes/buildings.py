@@ -44,7 +44,9 @@ class Plots:
 
     def ring(self, grow: ArrayLike = 0.0) -> Array:
         """Corners [n, 4, 2], counter-clockwise, moved outward by ``grow`` metres."""
-        return turned(rectangle(self.length + 2 * np.asarray(grow), self.width + 2 * np.asarray(grow)), self.angle, self.centre)
+        return turned(
+            rectangle(self.length + 2 * np.asarray(grow), self.width + 2 * np.asarray(grow)), self.angle, self.centre
+        )
 
 
 def facades(builder: Builder, plots: Plots, top: Array, *, storey: float = 3.0, bay: float = 3.2) -> None:
@@ -128,7 +130,9 @@ def pitched(
     sides = np.stack([eaves[:, 0], eaves[:, 1], ridge[:, 1], ridge[:, 0]], 1)
     back = np.stack([eaves[:, 2], eaves[:, 3], ridge[:, 0], ridge[:, 1]], 1)
     rows = _ridge(plots.angle, pitch_m)
-    builder.polygons(np.concatenate([sides, back]), np.tile(plots.roof, 2), np.tile(plots.roof_paint, (2, 1)), np.tile(rows, (2, 1)))
+    builder.polygons(
+        np.concatenate([sides, back]), np.tile(plots.roof, 2), np.tile(plots.roof_paint, (2, 1)), np.tile(rows, (2, 1))
+    )
     across = _ridge(plots.angle + np.pi / 2, pitch_m)
     ends = np.concatenate(
         [
@@ -144,7 +148,10 @@ def pitched(
     tip = turned(np.stack([np.stack([half_l, zero], -1), np.stack([-half_l, zero], -1)], 1), plots.angle, plots.centre)
     tip = lifted(tip, (plots.top + rise)[:, None])
     triangles = np.concatenate(
-        [np.stack([ring[:, 1], ring[:, 2], tip[:, 0]], 1)[gable], np.stack([ring[:, 3], ring[:, 0], tip[:, 1]], 1)[gable]]
+        [
+            np.stack([ring[:, 1], ring[:, 2], tip[:, 0]], 1)[gable],
+            np.stack([ring[:, 3], ring[:, 0], tip[:, 1]], 1)[gable],
+        ]
     )
     builder.polygons(triangles, m.WALL_PLAIN, np.tile(plots.wall_paint[gable], (2, 1)), (0, -1e4, 3, 3))
 
@@ -157,7 +164,9 @@ def chimneys(builder: Builder, plots: Plots, rise: Array, rng: np.random.Generat
     local = np.stack([rng.uniform(-0.25, 0.25, n) * plots.length, rng.choice([-0.18, 0.18], n) * plots.width], -1)
     centre = turned(local[:, None], plots.angle, plots.centre)[:, 0]
     size = np.stack([np.full(n, 0.7), np.full(n, 0.6), rise * 0.7 + 1.1], -1)
-    boxes(builder, centre, plots.angle, size, plots.top + 0.3, np.c_[np.tile([0.30, 0.13, 0.09], (n, 1)), rng.random(n)])
+    boxes(
+        builder, centre, plots.angle, size, plots.top + 0.3, np.c_[np.tile([0.30, 0.13, 0.09], (n, 1)), rng.random(n)]
+    )
 
 
 def roof_boxes(builder: Builder, plots: Plots, rng: np.random.Generator, per_area: float = 1 / 140) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
@@ -77,11 +79,9 @@ class Painter:
         x, y = np.meshgrid(self._centres[window[1]], self._centres[window[0]])
         return x, y
 
-    def area(
-        self, centre: ArrayLike, angle: float, length: float, width: float, kind: int | None, *, take: bool = False
-    ) -> None:
-        """Paint a rectangle (``kind`` None leaves the colour), and mark it as taken by an object."""
-        centre = np.asarray(centre, float)
+    def area(self, centre: ArrayLike, angle: float, size: ArrayLike, kind: int | None, *, take: bool = False) -> None:
+        """Paint a rectangle of ``size`` [2] (``kind`` None leaves the colour); ``take`` marks it as an object's."""
+        centre, (length, width) = np.asarray(centre, float), np.asarray(size, float)
         reach = np.hypot(length, width) / 2 + self.cell
         window = self._window(centre - reach, centre + reach)
         if window is None:
@@ -118,7 +118,8 @@ class Painter:
         """Paint a footpath or track along a line [k, 2]."""
         for start, end, _ in _pieces(np.asarray(line, float)):
             middle, along = (start + end) / 2, end - start
-            self.area(middle, float(np.arctan2(along[1], along[0])), float(np.hypot(*along)) + width * 0.8, width, kind)
+            length = float(np.hypot(*along)) + width * 0.8
+            self.area(middle, float(np.arctan2(along[1], along[0])), (length, width), kind)
 
     def street(self, line: ArrayLike, half_width: float) -> None:
         """Paint a street along a line [k, 2]; where streets meet, the nearer edge wins."""
@@ -152,11 +153,11 @@ class Painter:
             way = ((here - points[nearest]) * self._course[rows, cols]).sum(-1)
             self.road[rows, cols, 3] = np.abs(way) - reach[nearest]
 
-    def _cells(self, xy: Array, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    def _cells(self, xy: Array, count: int) -> tuple[NDArray, NDArray, NDArray]:
         index = np.floor((xy - self.low) * (count / self.size_m)).astype(int)
         inside = ((index >= 0) & (index < count)).all(-1)
         index = np.clip(index, 0, count - 1)
-        return index[..., 1], index[..., 0], inside
+        return index[..., 1], index[..., 0], np.asarray(inside)
 
     def _beside(self, xy: Array) -> Array:
         """Distance to the edge of the nearest painted street, metres; negative on it, large where none is near."""
@@ -174,14 +175,14 @@ class Painter:
             result &= inside & ~self.taken[row, col] & (self._beside(xy + offset) > 0)
         return result
 
-    def fits(self, centre: ArrayLike, angle: float, length: float, width: float) -> bool:
-        """Whether a rectangle is free everywhere, pavements included."""
+    def fits(self, centre: ArrayLike, angle: float, length: float, width: float, *, inside: bool = True) -> bool:
+        """Whether a rectangle is free everywhere, pavements included; ``inside`` False lets it reach over the rim."""
         steps_u, steps_v = (np.linspace(-0.5, 0.5, max(3, int(s / 2) + 2)) * s for s in (length, width))
         u, v = np.meshgrid(steps_u, steps_v)
         c, s = np.cos(angle), np.sin(angle)
         xy = np.stack([u * c - v * s, u * s + v * c], -1) + np.asarray(centre, float)
-        row, col, inside = self._cells(xy, len(self.kind))
-        return bool((inside & ~self.taken[row, col] & (self._beside(xy) > self.pavement)).all())
+        row, col, here = self._cells(xy, len(self.kind))
+        return bool(((here | (not inside)) & ~self.taken[row, col] & (self._beside(xy) > self.pavement)).all())
 
     def kind_at(self, xy: ArrayLike) -> NDArray[np.uint8]:
         row, col, _ = self._cells(np.asarray(xy, float), len(self.kind))
@@ -191,7 +192,7 @@ class Painter:
 def _pieces(line: Array) -> list[tuple[Array, Array, float]]:
     """Short straight pieces of a line: start, end and the way before."""
     pieces, before = [], 0.0
-    for start, end in zip(line[:-1], line[1:]):
+    for start, end in pairwise(line):
         length = float(np.hypot(*(end - start)))
         count = max(1, int(np.ceil(length / PIECE_M)))
         for i in range(count):

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from overfly.errors import InputError
 from overfly.geometry import Camera, distort, undistort
 from overfly.scenes.ground import GroundData
-from overfly.scenes.kernels import CHUNK, Ortho, View
+from overfly.scenes.kernels import CHUNK, View
+from overfly.scenes.ortho import Ortho
 from overfly.scenes.scene import Scene
 from overfly.scenes.shading import Surface
 
@@ -139,8 +140,9 @@ def _lens_table(camera: Camera) -> tuple[NDArray, NDArray, NDArray, float, float
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     target = np.stack(np.meshgrid(x, y), -1)
-    ideal = undistort(target, camera, iterations=60)
-    error = np.abs(distort(ideal, camera) - target).max() * max(camera.fx, camera.fy)
+    with np.errstate(over="ignore", invalid="ignore"):  # a lens that folds the image diverges, and is refused
+        ideal = undistort(target, camera, iterations=60)
+        error = np.abs(distort(ideal, camera) - target).max() * max(camera.fx, camera.fy)
     if not error < 0.01:
         raise InputError(
             f"The lens distortion k1={camera.k1}, k2={camera.k2}, k3={camera.k3}, p1={camera.p1}, p2={camera.p2} "

@@ -14,7 +14,8 @@ from overfly.mesh import Z_UP_FROM_Y_UP, read_mesh
 from overfly.ply import read_ply
 from overfly.scenes import materials as m
 from overfly.scenes.envelope import lower_envelope, top_raster
-from overfly.scenes.rasters import from_cloud, from_dsm
+from overfly.scenes.lidar import from_cloud
+from overfly.scenes.rasters import from_dsm
 from overfly.scenes.scene import Scene
 
 GREY = 0.3
@@ -60,7 +61,7 @@ def _from_mesh(path: Path) -> Scene:
         shape[:, 0] = _density(uv[faces], texture, 0.5 * np.linalg.norm(normal, axis=1))
     elif mesh.colors is not None:
         material[:], colors = m.VERTEX, mesh.colors
-    paint = np.tile(np.float32([GREY, GREY, GREY, 0]), (len(faces), 1))
+    paint = np.tile(np.array([GREY, GREY, GREY, 0], np.float32), (len(faces), 1))
     low, high = vertices.min(0), vertices.max(0)
     terrain = lower_envelope(*top_raster(_dense_points(vertices, faces, normal), low, high))
     return Scene(

@@ -1,3 +1,5 @@
+# mypy: ignore-errors
+# Kernels are written in the language of warp, which only looks like Python.
 """Procedural ground: meadow to asphalt, streets with lane marks, pavements and crossings."""
 
 from __future__ import annotations
@@ -107,9 +109,9 @@ def road_at(x: float, y: float, data: GroundData) -> wp.vec4:
         near = d
     if wp.abs(a[2] - d[2]) > 4.0 * cell or wp.abs(b[2] - c[2]) > 4.0 * cell:
         side = near[0]
-        r = (wp.vec4(wp.abs(a[0]), 0.0, 0.0, a[3]) * (1.0 - u) + wp.vec4(wp.abs(b[0]), 0.0, 0.0, b[3]) * u) * (1.0 - v) + (
-            wp.vec4(wp.abs(c[0]), 0.0, 0.0, c[3]) * (1.0 - u) + wp.vec4(wp.abs(d[0]), 0.0, 0.0, d[3]) * u
-        ) * v
+        r = (wp.vec4(wp.abs(a[0]), 0.0, 0.0, a[3]) * (1.0 - u) + wp.vec4(wp.abs(b[0]), 0.0, 0.0, b[3]) * u) * (
+            1.0 - v
+        ) + (wp.vec4(wp.abs(c[0]), 0.0, 0.0, c[3]) * (1.0 - u) + wp.vec4(wp.abs(d[0]), 0.0, 0.0, d[3]) * u) * v
         return wp.vec4(wp.sign(side) * r[0], near[1], near[2], 0.0)
     return wp.vec4(r[0], near[1], r[2], r[3])
 

@@ -12,7 +12,8 @@ from overfly.errors import InputError
 from overfly.geometry import Camera, is_rotation
 from overfly.scenes.appearance import Appearance
 from overfly.scenes.device import DeviceScene, ortho_view, perspective_view
-from overfly.scenes.kernels import CHUNK, EMPTY, Ortho, View, rasterize, rasterize_ortho, unpack
+from overfly.scenes.kernels import CHUNK, EMPTY, View, rasterize, unpack
+from overfly.scenes.ortho import Ortho, rasterize_ortho
 from overfly.scenes.scene import Scene
 from overfly.scenes.shading import Light, point_colors, shade
 
@@ -222,9 +223,9 @@ class Renderer:
 def surface_colors(scene: Scene, faces: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Unlit colours [n, 3] of points given by face [n] and barycentrics of its second and third vertex [n, 2]."""
     on_device = DeviceScene(scene, "cpu")
-    faces = np.argsort(on_device.order)[faces]
+    place = np.argsort(on_device.order)[faces]
     out = wp.empty((len(faces), 3), dtype=wp.uint8, device="cpu")
-    inputs = [wp.array(faces, dtype=wp.int32, device="cpu"), wp.array(weights, dtype=wp.vec2, device="cpu")]
+    inputs = [wp.array(place, dtype=wp.int32, device="cpu"), wp.array(weights, dtype=wp.vec2, device="cpu")]
     inputs += [on_device.surface, out]
     wp.launch(point_colors, dim=len(faces), inputs=inputs, device="cpu")
     return out.numpy()

@@ -21,7 +21,7 @@ SUFFIXES = (".ply", ".obj", ".glb", ".las", ".laz", ".tif", ".tiff")
 
 @dataclass(frozen=True)
 class Heightfield:
-    """Bare ground over a rectangle of uneven lines ``x`` [cols], ``y`` [rows] (ascending), ``z`` [rows, cols], metres."""
+    """Bare ground ``z`` [rows, cols] on uneven, ascending lines ``x`` [cols] and ``y`` [rows]; metres."""
 
     x: NDArray[np.float64]
     y: NDArray[np.float64]

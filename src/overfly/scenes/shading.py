@@ -1,3 +1,5 @@
+# mypy: ignore-errors
+# Kernels are written in the language of warp, which only looks like Python.
 """Colour: the kernel that turns visible faces into an image, and the one that colours loose surface points."""
 
 from __future__ import annotations
@@ -5,7 +7,8 @@ from __future__ import annotations
 import warp as wp
 
 from overfly.scenes.ground import GroundData, ground
-from overfly.scenes.kernels import Ortho, View, key_face, pixel_ray
+from overfly.scenes.kernels import View, key_face, pixel_ray
+from overfly.scenes.ortho import Ortho
 from overfly.scenes.textures import foliage, fractal, mix, noise, roof, wall
 
 wp.set_module_options({"enable_backward": False, "fast_math": True, "optimization_level": 3})
@@ -136,7 +139,7 @@ def lit(p: wp.vec3, n: wp.vec3, light: Light, shadow: wp.array2d(dtype=wp.float3
         return 1.0
     u = x - float(i)
     v = y - float(j)
-    seen = float(0.0)
+    seen = wp.float32(0.0)
     if z <= shadow[j, i] or shadow[j, i] == 0.0:
         seen += (1.0 - u) * (1.0 - v)
     if z <= shadow[j, i + 1] or shadow[j, i + 1] == 0.0:
@@ -174,10 +177,8 @@ def shade_ray(
     far = wp.length(local)
     flat = wp.normalize(wp.cross(e1, e2))
     n = s.normals[face[0]] * (1.0 - w1 - w2) + s.normals[face[1]] * w1 + s.normals[face[2]] * w2
-    if wp.dot(n, n) > 0.25:
-        n = wp.normalize(n)
-    else:
-        n = flat
+    smooth = wp.length(n)
+    n = wp.where(smooth > 0.5, n / wp.max(smooth, 0.1), flat)
     facing = wp.dot(flat, local)
     if facing > 0.0:
         flat = -flat
@@ -190,7 +191,7 @@ def shade_ray(
     if s.material[f] == 12:
         rough = 0.55 * wp.clamp(1.0 - foot, 0.2, 1.0)
         cosine = (cosine + 0.3 + rough * noise(1.9 * p[0] + 1.1 * p[2], 1.9 * p[1] - 0.7 * p[2], s.seed + 77)) / 1.3
-    direct = float(0.0)
+    direct = wp.float32(0.0)
     if cosine > 0.0 and wp.dot(flat, light.sun) > -0.2:
         direct = cosine * light.sun_strength
         if light.shadows != 0:
@@ -214,7 +215,7 @@ def shade(
     grain: wp.array3d(dtype=wp.float32),
     image: wp.array3d(dtype=wp.uint8),
 ):
-    """One thread per pixel of the image: the mean of its ``samples`` x ``samples`` rays, then the camera's electronics."""
+    """One thread per pixel: the mean of its ``samples`` x ``samples`` rays, then the camera's electronics."""
     row, col = wp.tid()
     eye = wp.vec3(view.eye)
     world = wp.transpose(view.camera_from_world)

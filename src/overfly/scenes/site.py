@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from overfly.scenes import materials as m
-from overfly.scenes.buildings import Plots
 from overfly.scenes.builder import Array, Builder, boxes
+from overfly.scenes.buildings import Plots
 from overfly.scenes.cover import Painter, along
 from overfly.scenes.scene import Heightfield, Scene
 from overfly.scenes.terrain import Relief, heightfield
@@ -15,11 +15,25 @@ from overfly.scenes.vegetation import CONE, DOME, IRREGULAR, scatter, trees
 from overfly.scenes.vehicles import cars
 
 PLASTER = np.array(
-    [(0.62, 0.58, 0.50), (0.68, 0.66, 0.62), (0.55, 0.44, 0.30), (0.50, 0.36, 0.28), (0.58, 0.56, 0.44), (0.42, 0.42, 0.41)]
+    [
+        (0.62, 0.58, 0.50),
+        (0.68, 0.66, 0.62),
+        (0.55, 0.44, 0.30),
+        (0.50, 0.36, 0.28),
+        (0.58, 0.56, 0.44),
+        (0.42, 0.42, 0.41),
+    ]
 )
 BRICK = np.array([(0.30, 0.13, 0.09), (0.36, 0.20, 0.13), (0.24, 0.12, 0.10)])
 TILE = np.array(
-    [(0.31, 0.115, 0.065), (0.25, 0.10, 0.07), (0.36, 0.16, 0.09), (0.17, 0.09, 0.07), (0.10, 0.10, 0.105), (0.065, 0.065, 0.07)]
+    [
+        (0.31, 0.115, 0.065),
+        (0.25, 0.10, 0.07),
+        (0.36, 0.16, 0.09),
+        (0.17, 0.09, 0.07),
+        (0.10, 0.10, 0.105),
+        (0.065, 0.065, 0.07),
+    ]
 )
 FLAT_ROOF = np.array([(0.36, 0.35, 0.33), (0.22, 0.22, 0.22), (0.13, 0.13, 0.135), (0.55, 0.55, 0.54)])
 
@@ -53,7 +67,7 @@ class Site:
             extent=(-half, -half, half, half),
             cover=self.painter.cover(),
             seed=self.seed,
-            **self.builder.arrays(),
+            **self.builder.arrays(),  # type: ignore[arg-type]
         )
 
     def world(self, local: ArrayLike) -> Array:
@@ -65,7 +79,7 @@ class Site:
 
     def take(self, centre: ArrayLike, angle: float, length: float, width: float, margin: float = 0.0) -> None:
         """Mark a rectangle as taken by an object."""
-        self.painter.area(centre, angle, length + 2 * margin, width + 2 * margin, None, take=True)
+        self.painter.area(centre, angle, (length + 2 * margin, width + 2 * margin), None, take=True)
 
     def plots(
         self,
@@ -162,7 +176,7 @@ class Site:
         return scatter(self.rng, (-half, -half), (half, half), spacing)
 
     def park(self, line: ArrayLike, offset: float, share: float, *, step: float = 6.2) -> None:
-        """Cars along both sides of a street's line, ``offset`` metres from its axis; ``share`` of the places are used."""
+        """Cars on both sides of a street, ``offset`` metres from its axis; ``share`` of the places are used."""
         for side in (-1, 1):
             xy, angle = along(line, step, float(self.rng.uniform(0, step)))
             if not len(xy):
@@ -175,22 +189,22 @@ class Site:
             cars(self.builder, xy, angle + turn + self.rng.normal(0, 0.02, len(xy)), self.field(xy), self.rng)
 
     def inner(self, xy: Array, margin: float) -> NDArray[np.bool_]:
-        return (np.abs(xy) <= self.size_m / 2 - margin).all(-1)
+        return np.asarray((np.abs(xy) <= self.size_m / 2 - margin).all(-1))
 
-    def parking(self, centre: ArrayLike, length: float, width: float, share: float) -> None:
+    def parking(self, centre: ArrayLike, size: ArrayLike, share: float) -> None:
         """A car park along the layout's axes: stalls as the kernel draws them (2.5 m by 5 m in rows of 16 m)."""
-        centre = np.asarray(centre, float)
-        if not self.painter.fits(centre, self.heading, length, width):
+        centre, size = np.asarray(centre, float), np.asarray(size, float)
+        if not self.painter.fits(centre, self.heading, *size, inside=False):
             return
-        self.painter.area(centre, self.heading, length, width, m.PARKING, take=True)
+        self.painter.area(centre, self.heading, size, m.PARKING, take=True)
         c, s = np.cos(self.heading), np.sin(self.heading)
         local = np.array([centre[0] * c + centre[1] * s, centre[1] * c - centre[0] * s])
-        first = np.floor((local - [length / 2, width / 2]) / [2.5, 16.0]).astype(int)
-        last = np.ceil((local + [length / 2, width / 2]) / [2.5, 16.0]).astype(int)
+        first = np.floor((local - size / 2) / [2.5, 16.0]).astype(int)
+        last = np.ceil((local + size / 2) / [2.5, 16.0]).astype(int)
         i, j = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
         x = (i.ravel() + 0.52) * 2.5
         places = np.concatenate([np.stack([x, j.ravel() * 16.0 + 2.5], -1), np.stack([x, j.ravel() * 16.0 + 7.5], -1)])
-        room = (np.abs(places - local) <= [length / 2 - 1.5, width / 2 - 2.6]).all(1)
+        room = (np.abs(places - local) <= size / 2 - [1.5, 2.6]).all(1)
         places = places[room & (self.rng.random(len(places)) < share)]
         xy = self.world(places)
         xy = xy[self.inner(xy, 2)]
@@ -214,25 +228,3 @@ class Site:
             size = np.stack([np.full(n, 0.22), np.full(n, 0.22), roof - ground + 0.3], -1)
             boxes(self.builder, posts, angle, size, ground - 0.3, grey * [0.6, 0.6, 0.6, 1])
         self.painter.path(line, width, m.PAVING)
-
-
-def street_grid(
-    site: Site, pitch_x: tuple[float, float], pitch_y: tuple[float, float], half_width: tuple[float, float]
-) -> tuple[Array, Array, list[Array]]:
-    """Streets along both axes of the layout; returns their places on x and on y, and their lines in the world."""
-    reach = site.size_m * 0.75
-    rng = site.rng
-
-    def places(pitch: tuple[float, float]) -> Array:
-        steps = rng.uniform(*pitch, int(2 * reach / pitch[0]) + 2)
-        at = np.cumsum(steps) - reach - rng.uniform(0, pitch[0])
-        return at[at < reach]
-
-    xs, ys = places(pitch_x), places(pitch_y)
-    lines = [site.world([(x, -reach), (x, reach)]) for x in xs] + [site.world([(-reach, y), (reach, y)]) for y in ys]
-    widths = rng.choice(half_width, len(lines))
-    for line, width in zip(lines, widths):
-        site.painter.street(line, float(width))
-    wider = np.maximum(*np.meshgrid(widths[: len(xs)], widths[len(xs) :]))
-    site.painter.crossings(site.world(np.stack(np.meshgrid(xs, ys), -1)), wider)
-    return xs, ys, lines

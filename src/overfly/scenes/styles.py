@@ -8,12 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from overfly.scenes import materials as m
+from overfly.scenes.blocks import blocks
+from overfly.scenes.campus import campus
+from overfly.scenes.countryside import vegetation, village
 from overfly.scenes.cover import Painter
-from overfly.scenes.rural import suburb, vegetation, village
+from overfly.scenes.industrial import industrial
 from overfly.scenes.scene import STYLES, Scene
 from overfly.scenes.site import Site
+from overfly.scenes.suburb import suburb
 from overfly.scenes.terrain import Relief
-from overfly.scenes.urban import blocks, campus, industrial
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,7 @@ def build(style: str, seed: int, size_m: float, relief: float | None) -> Scene:
     rng = np.random.default_rng([STYLES.index(style), seed])
     ground = Relief(rng, size_m, facts.relief if relief is None else relief)
     heading = float(rng.uniform(-np.pi / 4, np.pi / 4))
-    painter = Painter(
-        size_m, heading, facts.background, pavement=facts.pavement, marked=facts.marked, wild=facts.wild
-    )
+    painter = Painter(size_m, heading, facts.background, pavement=facts.pavement, marked=facts.marked, wild=facts.wild)
     _ponds(rng, ground, painter, facts.pond)
     site = Site(f"{style}-{seed}", seed, rng, size_m, ground, painter)
     facts.build(site)
@@ -75,4 +76,6 @@ def _ponds(rng: np.random.Generator, ground: Relief, painter: Painter, odds: flo
         radius = float(rng.uniform(12, 26))
         ground.level(centre, radius * 1.25)
         for _ in range(5):
-            painter.disc(centre + rng.normal(0, 0.3 * radius, 2), radius * float(rng.uniform(0.5, 0.8)), m.WATER, take=True)
+            painter.disc(
+                centre + rng.normal(0, 0.3 * radius, 2), radius * float(rng.uniform(0.5, 0.8)), m.WATER, take=True
+            )

@@ -1,3 +1,5 @@
+# mypy: ignore-errors
+# Kernels are written in the language of warp, which only looks like Python.
 """Procedural textures in world space, evaluated per sample inside the shading kernel.
 
 All take ``foot``, the size in metres of the pixel on the surface, and fade whatever is finer, so that nothing aliases.
@@ -14,7 +16,11 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def hash01(ix: int, iy: int, seed: int) -> float:
     """A number in [0, 1) of an integer cell."""
-    h = wp.uint32(ix) * wp.uint32(1597334677) + wp.uint32(iy) * wp.uint32(1812433253) + wp.uint32(seed) * wp.uint32(374761393)
+    h = (
+        wp.uint32(ix) * wp.uint32(1597334677)
+        + wp.uint32(iy) * wp.uint32(1812433253)
+        + wp.uint32(seed) * wp.uint32(374761393)
+    )
     h = (h ^ (h >> wp.uint32(15))) * wp.uint32(739982445)
     h = (h ^ (h >> wp.uint32(12))) * wp.uint32(695872825)
     h = h ^ (h >> wp.uint32(15))
@@ -51,8 +57,8 @@ def noise(x: float, y: float, seed: int) -> float:
 @wp.func
 def fractal(x: float, y: float, seed: int, wave: float, octaves: int, gain: float, foot: float) -> float:
     """Octaves of noise from wavelength ``wave`` (metres) down, each turned and weaker by ``gain``."""
-    total = float(0.0)
-    strength = float(1.0)
+    total = wp.float32(0.0)
+    strength = wp.float32(1.0)
     resolved = 0.7 * wave / foot
     px = x / wave
     py = y / wave
@@ -101,17 +107,29 @@ def wall(p: wp.vec3, normal: wp.vec3, material: int, paint: wp.vec4, shape: wp.v
     stain = 1.0 + 0.12 * fractal(u, h * 0.35, own, 3.5, 4, 0.65, foot)
     color = base * stain
     if material == 5:  # corrugated sheets, with panel joints
-        color = color * (1.0 - 0.22 * band(u / 0.33, 0.55, 0.95, foot / 0.33)) * (1.0 - 0.3 * band(u / 6.0, 0.0, 0.012, foot / 6.0))
+        color = (
+            color
+            * (1.0 - 0.22 * band(u / 0.33, 0.55, 0.95, foot / 0.33))
+            * (1.0 - 0.3 * band(u / 6.0, 0.0, 0.012, foot / 6.0))
+        )
         if h > 0.6 and h < 3.6:  # doors
             cell = int(wp.floor(u / 6.0))
             if hash01(cell, 3, own) > 0.72:
-                color = mix(color, wp.vec3(0.25, 0.26, 0.28) * (0.7 + hash01(cell, 5, own)), band(u / 6.0, 0.25, 0.75, foot / 6.0))
+                color = mix(
+                    color,
+                    wp.vec3(0.25, 0.26, 0.28) * (0.7 + hash01(cell, 5, own)),
+                    band(u / 6.0, 0.25, 0.75, foot / 6.0),
+                )
         return color
     if material == 6:
         course = wp.floor(h / 0.25)
         shift = 0.5 * (course - 2.0 * wp.floor(course * 0.5))
         joints = wp.max(band(h / 0.25, 0.0, 0.12, foot / 0.25), band(u / 0.5 + shift, 0.0, 0.06, foot / 0.5))
-        color = mix(color * (0.85 + 0.3 * hash01(int(wp.floor(u / 0.5 + shift)), int(course), own)), wp.vec3(0.35, 0.33, 0.30), 0.6 * joints)
+        color = mix(
+            color * (0.85 + 0.3 * hash01(int(wp.floor(u / 0.5 + shift)), int(course), own)),
+            wp.vec3(0.35, 0.33, 0.30),
+            0.6 * joints,
+        )
     if h < 0.0:
         color = color * 0.6
     storey = wp.max(shape[2], 1.0)

@@ -17,12 +17,18 @@ CONE, DOME, IRREGULAR = 0, 1, 2
 def _sphere(level: int) -> tuple[Array, NDArray[np.int32]]:
     """A unit icosphere without its hidden underside."""
     golden = (1 + 5**0.5) / 2
-    vertices = [(a, b, 0.0) for a in (-1, 1) for b in (-golden, golden)]
-    vertices = vertices + [(0.0, a, b) for _, a, b in [(0, v[0], v[1]) for v in vertices]] + [(v[1], 0.0, v[0]) for v in vertices]
+    flat = [(a, b) for a in (-1.0, 1.0) for b in (-golden, golden)]
+    vertices = [(a, b, 0.0) for a, b in flat] + [(0.0, a, b) for a, b in flat] + [(b, 0.0, a) for a, b in flat]
     points = np.array(vertices) / np.hypot(1, golden)
     edge = 2 / np.hypot(1, golden)
     near = np.abs(np.linalg.norm(points[:, None] - points[None], axis=-1) - edge) < 1e-6
-    faces = [(i, j, k) for i in range(12) for j in range(i + 1, 12) for k in range(j + 1, 12) if near[i, j] and near[j, k] and near[i, k]]
+    faces = [
+        (i, j, k)
+        for i in range(12)
+        for j in range(i + 1, 12)
+        for k in range(j + 1, 12)
+        if near[i, j] and near[j, k] and near[i, k]
+    ]
     triangles = np.array(faces)
     for _ in range(level):
         pairs = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
@@ -40,13 +46,14 @@ def _sphere(level: int) -> tuple[Array, NDArray[np.int32]]:
 
 def _cone(sides: int) -> tuple[Array, NDArray[np.int32]]:
     """Three stacked skirts in a unit cylinder, z from -1 to 1."""
-    points, faces = [], []
+    points: list[tuple[float, float, float]] = []
+    faces: list[tuple[int, int, int]] = []
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     for tier, (low, high, radius) in enumerate(((-1.0, 0.1, 1.0), (-0.35, 0.6, 0.72), (0.25, 1.0, 0.42))):
         base = len(points)
         turn = angle + tier * 0.5
         ragged = radius * (1 + 0.14 * np.cos(3 * turn + tier))
-        points += list(zip(ragged * np.cos(turn), ragged * np.sin(turn), np.full(sides, low))) + [(0.0, 0.0, high)]
+        points += [*zip(ragged * np.cos(turn), ragged * np.sin(turn), np.full(sides, low)), (0.0, 0.0, high)]
         faces += [(base + i, base + (i + 1) % sides, base + sides) for i in range(sides)]
     return np.array(points), np.array(faces, np.int32)
 
@@ -84,7 +91,7 @@ def trees(
     trunks: bool = True,
     tint: tuple[float, float, float] = (0.055, 0.10, 0.028),
 ) -> None:
-    """n trees: foot [n, 2], ground [n], total height and crown radius [n] in metres, kind [n] (CONE, DOME, IRREGULAR)."""
+    """n trees: foot [n, 2], ground [n], height and crown radius [n] in metres, kind [n] (CONE, DOME, IRREGULAR)."""
     xy, ground, height, radius, kind = (np.asarray(v) for v in (xy, ground, height, radius, kind))
     variant = rng.integers(0, 6, len(xy))
     turn = rng.random(len(xy)) * 2 * np.pi

@@ -25,6 +25,7 @@ class FullStage(GanStage):
 
     terms: ClassVar[tuple[str, ...]] = (*GanStage.terms, "correspondence", "retrieval", "correction")
     accuracy: ClassVar[str] = "near_2pct"
+    loss: ClassVar[str] = "loss_generator"
 
     def __init__(self, *, pixels: int, **others: Any) -> None:
         super().__init__(freeze_encoder=False, **others)

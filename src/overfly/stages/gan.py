@@ -17,12 +17,16 @@ class GanStage(Stage):
     """Alternating optimisation of ``network.generator`` and ``network.discriminator`` (section 3.3, Eq. 1).
 
     Each batch is one step of the discriminator on the clouds as they are, then one of the generator. *Accuracy* is the
-    share of clouds, real and generated, that the discriminator calls right.
+    share of clouds, real and generated, that the discriminator calls right, and *loss* is its cross-entropy, as in the
+    paper's Figure 3c and d; ``loss_generator`` is what the generator minimises (and the loss without a discriminator).
 
     Args:
         discriminator_optimizer: as ``optimizer``, for the second player.
         freeze_encoder: keep the encoder's weights and batch statistics; an encoder that was never trained is always
             trained along (a frozen random one would hide the images from the generator), and a line says so.
+        discriminator_noise: standard deviation, in window units, of the noise on x and y of every cloud that the
+            discriminator sees. Generated clouds stand in a grid of spacing 2 / 32, real ones do not: without noise it
+            would look at nothing else and push the points off the grid instead of onto the surface.
         emd_points: size of the random subsets on which the ``emd`` term is computed (0.08 s a window at 1024).
         emd_batches: validation and test batches on which the exact EMD is measured.
         others: see :class:`overfly.stages.stage.Stage`.
@@ -30,12 +34,14 @@ class GanStage(Stage):
 
     terms: ClassVar[tuple[str, ...]] = ("chamfer", "emd", "adversarial", "adversarial_eq1")
     accuracy: ClassVar[str] = "discriminator_accuracy"
+    loss: ClassVar[str] = "loss_discriminator"
 
     def __init__(
         self,
         *,
         discriminator_optimizer: OptimizerFactory,
         freeze_encoder: bool,
+        discriminator_noise: float,
         emd_points: int,
         emd_batches: int,
         **others: Any,
@@ -43,6 +49,7 @@ class GanStage(Stage):
         super().__init__(**others)
         self.discriminator_optimizer_factory = discriminator_optimizer
         self.freeze_encoder, self.emd_points, self.emd_batches = freeze_encoder, emd_points, emd_batches
+        self.discriminator_noise = discriminator_noise
         self.frozen: bool | None = None  # decided when the training begins, kept in checkpoints
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
@@ -88,11 +95,10 @@ class GanStage(Stage):
         cloud, real = output["points"], batch["reference"]
         players = self.optimizers()
         assert isinstance(players, list)
-        judged = None
+        random, judged = self.random(batch_idx), None
         if self._adversarial():
-            judged = self._discriminator_step(players[1], cloud.detach(), real, batch_idx)
+            judged = self._discriminator_step(players[1], cloud.detach(), real, batch_idx, random)
         with self.toggled_optimizer(players[0]):
-            random = self.random(batch_idx)
             terms = {**self._cloud_terms(cloud, real, random), **self._more_terms(output, batch, random)}
             loss = self.total(terms)
             parts = ["generator"] if self.frozen else ["encoder", "generator"]
@@ -108,9 +114,11 @@ class GanStage(Stage):
     def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         self._evaluate(batch, batch_idx, self.test_split(dataloader_idx))
 
-    def _discriminator_step(self, optimizer: Any, cloud: Tensor, real: Tensor, batch_idx: int) -> tuple[Tensor, Tensor]:
+    def _discriminator_step(
+        self, optimizer: Any, cloud: Tensor, real: Tensor, batch_idx: int, random: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
         with self.toggled_optimizer(optimizer):
-            on_real, on_cloud = self._logits(real), self._logits(cloud)
+            on_real, on_cloud = self._logits(real, random), self._logits(cloud, random)
             self.optimise(optimizer, losses.discriminator(on_real, on_cloud).mean(), batch_idx, ["discriminator"])
         return on_real.detach(), on_cloud.detach()
 
@@ -119,12 +127,10 @@ class GanStage(Stage):
         if "chamfer" in self.weights:
             terms["chamfer"] = losses.chamfer(cloud, real)
         if "emd" in self.weights:
-            chosen = [
-                torch.randperm(x.shape[1], generator=random)[: self.emd_points].to(x.device) for x in (cloud, real)
-            ]
-            terms["emd"] = losses.emd(cloud[:, chosen[0]], real[:, chosen[1]])
+            a, b = (torch.randperm(x.shape[1], generator=random)[: self.emd_points] for x in (cloud, real))
+            terms["emd"] = losses.emd(cloud[:, a.to(cloud.device)], real[:, b.to(real.device)])
         if self._adversarial():
-            logits = self._logits(cloud)
+            logits = self._logits(cloud, random)
             for name in ("adversarial", "adversarial_eq1"):
                 if name in self.weights:
                     terms[name] = getattr(losses, name)(logits)
@@ -141,7 +147,7 @@ class GanStage(Stage):
         self._report_losses(split, self.total(terms), terms, len(real))
         self._report_clouds(split, cloud, batch)
         if self._adversarial():
-            self._report_players(split, self._logits(real), self._logits(cloud))
+            self._report_players(split, self._logits(real, random), self._logits(cloud, random))
         if batch_idx < self.emd_batches and cloud.shape[1] == real.shape[1]:
             pairs = zip(cloud.cpu().numpy(), real.cpu().numpy(), strict=True)
             values = [window_emd(a, b) for a, b in pairs]
@@ -150,8 +156,10 @@ class GanStage(Stage):
     def _adversarial(self) -> bool:
         return "adversarial" in self.weights or "adversarial_eq1" in self.weights
 
-    def _logits(self, points: Tensor) -> Tensor:
-        logits: Tensor = self.network.discriminator.logits(points)  # type: ignore[union-attr, operator]
+    def _logits(self, points: Tensor, random: torch.Generator) -> Tensor:
+        noise = torch.randn(points.shape, generator=random).to(points) * self.discriminator_noise
+        noise[..., 2] = 0
+        logits: Tensor = self.network.discriminator.logits(points + noise)  # type: ignore[union-attr, operator]
         return logits
 
     def _blocks_from_encoder(self) -> str:
@@ -160,7 +168,7 @@ class GanStage(Stage):
 
     def _report_losses(self, split: str, loss: Tensor, terms: dict[str, Tensor], count: int) -> None:
         named = {f"loss_{name}": value.detach().mean() for name, value in terms.items()}
-        self.report(split, {"loss": loss.detach(), **named}, count)
+        self._report(split, {"loss_generator": loss.detach(), **named}, count)
 
     def _report_clouds(self, split: str, cloud: Tensor, batch: Batch) -> None:
         arrays = (x.detach().cpu().numpy() for x in (cloud, batch["reference"], batch["scale"]))
@@ -173,6 +181,7 @@ class GanStage(Stage):
         self._report(split, {"loss_discriminator": loss, "discriminator_accuracy": right}, len(on_real))
 
     def _report(self, split: str, values: dict[str, Any], count: int) -> None:
-        if self.accuracy in values:
-            values["accuracy"] = values[self.accuracy]
-        self.report(split, values, count)
+        """Log values, and again as ``loss`` and ``accuracy`` those that are this stage's."""
+        names = {"accuracy": self.accuracy, "loss": self.loss if self._adversarial() else "loss_generator"}
+        again = {name: values[source] for name, source in names.items() if source in values}
+        self.report(split, {**values, **again}, count)

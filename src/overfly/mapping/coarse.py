@@ -1,0 +1,80 @@
+"""A first look at the ground where cameras are given without any points: few pairs at low resolution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from overfly.errors import InputError
+from overfly.flights import Frame
+from overfly.geometry import Array, Camera, unproject
+from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities
+from overfly.mapping.rectify import ordered, rectify
+
+LONGEST_SIDE = 320
+PAIRS = 24
+
+
+def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
+    """Points [M, 3] on the surface, some hundred of each of a few dozen pairs, from cameras and images alone.
+
+    The whole disparity range is searched, from a quarter of the image's width to 1 % of it.
+
+    Raises:
+        InputError: no pair of neighbours shows the same ground.
+    """
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    centres = np.array([np.asarray(f.world_from_camera)[:3, 3] for f in frames])
+    found = []
+    step = max(1, len(frames) // PAIRS)
+    for i in range(0, len(frames), step):
+        near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")
+        for j in [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]:
+            pair = [frames[i], frames[j]]
+            poses = [np.asarray(f.world_from_camera, float) for f in pair]
+            if not ordered((poses[0], poses[1])):
+                pair, poses = pair[::-1], poses[::-1]
+            cameras = [_small(f) for f in pair]
+            baseline = float(np.linalg.norm(poses[0][:3, 3] - poses[1][:3, 3]))
+            reach = cameras[0].fx * baseline / cameras[0].width
+            span = (reach / 0.9, reach / 0.02)
+            layout = rectify((cameras[0], cameras[1]), (poses[0], poses[1]), (span, span))
+            if layout is None:
+                continue
+            gray = [cv2.resize(_gray(f), (c.width, c.height), interpolation=cv2.INTER_AREA) for f, c in zip(pair, cameras)]
+            match = disparities((gray[0], gray[1]), (cameras[0], cameras[1]), (poses[0], poses[1]), layout)
+            if (match != UNKNOWN).mean() < 0.02:
+                continue
+            ideal = cameras[0].undistorted()
+            depth = depth_in_frame(match, ideal, poses[0], layout, right=False)
+            rows, columns = np.nonzero(np.isfinite(depth))
+            if len(rows) < 200:
+                continue
+            pick = rng.choice(len(rows), 200, replace=False)
+            rows, columns = rows[pick], columns[pick]
+            pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+            found.append(unproject(pixels, depth[rows, columns], ideal, poses[0]))
+    if not found:
+        raise InputError(
+            "No two neighbouring images match with the given cameras: check that the cameras belong to these images, "
+            "or map with --cameras estimate."
+        )
+    points = np.concatenate(found)
+    # Wrong matches are few and far: keep what lies among the others.
+    away = np.abs(points[:, 2] - np.median(points[:, 2]))
+    return points[away <= 6 * np.median(away) + 1e-6]
+
+
+def _small(frame: Frame) -> Camera:
+    assert frame.camera is not None
+    factor = min(1.0, LONGEST_SIDE / max(frame.width, frame.height))
+    return frame.camera.resized(round(frame.width * factor), round(frame.height * factor))
+
+
+def _gray(frame: Frame) -> np.ndarray:
+    import cv2
+
+    return cv2.cvtColor(frame.image(), cv2.COLOR_RGB2GRAY)

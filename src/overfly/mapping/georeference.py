@@ -1,0 +1,131 @@
+"""From the arbitrary frame of a reconstruction to local ENU metres, or at least to a levelled frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from overfly.errors import InputError
+from overfly.geometry import Array, fit_similarity, rotation_from_gimbal, transform
+
+COLLINEAR = 0.08
+"""Below this ratio of the horizontal spreads, positions lie on a line and do not say which way is up."""
+
+NOMINAL_HEIGHT = 100.0
+"""Height of the cameras over the ground where the scale is unknown."""
+
+
+def by_gps(positions: Array, told: Array, gimbals: list[tuple[float, float, float] | None], rotations: Array) -> Array:
+    """The similarity [4, 4] that brings camera positions to their GPS positions.
+
+    Args:
+        positions: [n, 3] in the reconstruction's frame.
+        told: [n, 3] local ENU metres, height NaN where GPS has none.
+        gimbals: yaw, pitch, roll of each frame, or None.
+        rotations: [n, 3, 3] reconstruction-from-camera.
+
+    Frames far off the common fit (a wrong fix) lose their weight. Where the flight is a line or has no heights, the
+    gimbals or the cameras' own up direction level it, and GPS gives scale, heading and place alone.
+
+    Raises:
+        InputError: fewer than two frames have GPS, or all at the same place.
+    """
+    known = np.isfinite(told[:, :2]).all(1)
+    if known.sum() < 2 or np.ptp(told[known, :2], axis=0).max() < 1.0:
+        raise InputError("The GPS positions are too few or all at one place, so they cannot scale the map.")
+    centred = told[known, :2] - told[known, :2].mean(0)
+    spread = np.linalg.svd(centred, compute_uv=False)
+    if known.sum() >= 4 and spread[1] > COLLINEAR * spread[0] and np.isfinite(told[known, 2]).all():
+        return _robust(positions[known], told[known])
+    level = np.eye(4)
+    level[:3, :3] = _upright(gimbals, rotations)
+    upright = transform(level, positions)
+    flat_from = np.column_stack([upright[known, :2], np.zeros(known.sum())])
+    flat_to = np.column_stack([told[known, :2], np.zeros(known.sum())])
+    matrix = _robust(flat_from, flat_to) @ level
+    heights = told[:, 2] - transform(matrix, positions)[:, 2]
+    matrix[2, 3] += float(np.nanmedian(heights)) if np.isfinite(heights).any() else 0.0
+    return matrix
+
+
+def _robust(source: Array, target: Array) -> Array:
+    """A similarity by iteratively reweighted least squares (Cauchy weights at the median residual)."""
+    weights = np.ones(len(source))
+    flat = not np.any(target[:, 2]) and not np.any(source[:, 2])
+    matrix = np.eye(4)
+    for _ in range(30):
+        matrix = _fit_flat(source, target, weights) if flat else fit_similarity(source, target, weights=weights)
+        away = np.linalg.norm(transform(matrix, source) - target, axis=1)
+        weights = 1 / (1 + (away / max(2 * float(np.median(away)), 1e-6)) ** 2)
+    return matrix
+
+
+def _fit_flat(source: Array, target: Array, weights: Array) -> Array:
+    """Heading, scale and shift in the plane, as one complex regression."""
+    w = weights / weights.sum()
+    a, b = source[:, 0] + 1j * source[:, 1], target[:, 0] + 1j * target[:, 1]
+    mean_a, mean_b = (w * a).sum(), (w * b).sum()
+    turn = (w * np.conj(a - mean_a) * (b - mean_b)).sum() / (w * np.abs(a - mean_a) ** 2).sum()
+    shift = mean_b - turn * mean_a
+    matrix = np.eye(4) * abs(turn)
+    matrix[3, 3] = 1
+    matrix[:2, :2] = [[turn.real, -turn.imag], [turn.imag, turn.real]]
+    matrix[:2, 3] = shift.real, shift.imag
+    return matrix
+
+
+def _upright(gimbals: list[tuple[float, float, float] | None], rotations: Array) -> Array:
+    """The rotation [3, 3] that turns the reconstruction's up to +z: by gimbals, else against the mean view."""
+    ups = [
+        rotation @ rotation_from_gimbal(*gimbal)[2]  # the world's z in camera axes
+        for gimbal, rotation in zip(gimbals, rotations, strict=True)
+        if gimbal is not None
+    ]
+    up = np.mean(ups, axis=0) if ups else -rotations[:, :, 2].mean(0)
+    return _to_z(up)
+
+
+def _to_z(up: Array) -> Array:
+    up = up / np.linalg.norm(up)
+    axis = np.array([1.0, 0, 0]) if abs(up[0]) < 0.9 else np.array([0, 1.0, 0])
+    x = np.cross(axis, up)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])
+
+
+def by_ground(positions: Array, points: Array, rotations: Array, seed: int) -> Array:
+    """Level a reconstruction without GPS by the plane of its ground points; the cameras stand 100 units above it.
+
+    Args:
+        positions: [n, 3] of the cameras.
+        points: [m, 3] sparse points.
+        rotations: [n, 3, 3] reconstruction-from-camera.
+        seed: of the random planes that are tried.
+    """
+    rng = np.random.default_rng(seed)
+    view = rotations[:, :, 2].mean(0)
+    spread = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    best, normal, offset = -1, -view, 0.0
+    for _ in range(2000):
+        three = points[rng.choice(len(points), 3, replace=False)]
+        candidate = np.cross(three[1] - three[0], three[2] - three[0])
+        length = np.linalg.norm(candidate)
+        if length < 1e-12:
+            continue
+        candidate = candidate / length
+        candidate = candidate if candidate @ view < 0 else -candidate
+        if candidate @ view > -0.5:  # more than 60 degrees off the mean view: a wall
+            continue
+        inside = int((np.abs((points - three[0]) @ candidate) < 0.03 * spread).sum())
+        if inside > best:
+            best, normal, offset = inside, candidate, float(three[0] @ candidate)
+    near = points[np.abs(points @ normal - offset) < 0.03 * spread]
+    if len(near) >= 10:  # the plane of all that are near it
+        _, _, axes = np.linalg.svd(near - near.mean(0), full_matrices=False)
+        normal, offset = axes[2] * np.sign(axes[2] @ normal), float(near.mean(0) @ axes[2] * np.sign(axes[2] @ normal))
+    matrix = np.eye(4)
+    scale = NOMINAL_HEIGHT / max(float(np.median(positions @ normal - offset)), 1e-9)
+    matrix[:3, :3] = scale * _to_z(normal)
+    middle = transform(matrix, positions).mean(0)
+    matrix[:2, 3] = -middle[:2]
+    matrix[2, 3] = -scale * offset
+    return matrix

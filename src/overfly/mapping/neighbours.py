@@ -1,0 +1,86 @@
+"""Which frames make good stereo pairs: much common ground, a base-to-height ratio that measures, no twisted views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from overfly.geometry import Array, Camera, project, unproject
+
+GRID = 8
+"""Samples of a frame's ground along each side of the image."""
+
+CANDIDATES = 40
+"""Nearest cameras that are looked at."""
+
+REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
+"""What seeing a place once more is worth: the first partner of a place makes it measured, the later ones make it sure."""
+
+
+def choose_partners(
+    cameras: Sequence[Camera], poses: Sequence[Array], depths: Sequence[float], *, count: int, ratio: tuple[float, float]
+) -> list[list[int]]:
+    """The partners of every frame, best first.
+
+    Args:
+        cameras, poses: of n frames.
+        depths: median depth of each frame's ground, metres.
+        count: most partners of a frame.
+        ratio: smallest and largest base-to-height ratio.
+
+    Returns:
+        n lists of frame indices; empty where nothing overlaps. Partners are chosen one by one for the ground they add
+        (a greedy set cover), so that the rim of a frame gets its partner, too, also at 30 % overlap.
+    """
+    centres = np.array([pose[:3, 3] for pose in poses])
+    return [_partners(i, cameras, poses, centres, depths[i], count, ratio) for i in range(len(cameras))]
+
+
+def _partners(
+    i: int,
+    cameras: Sequence[Camera],
+    poses: Sequence[Array],
+    centres: Array,
+    depth: float,
+    count: int,
+    ratio: tuple[float, float],
+) -> list[int]:
+    camera, world_from_camera = cameras[i], poses[i]
+    side = (np.arange(GRID) + 0.5) / GRID
+    pixels = np.stack(np.meshgrid(side * camera.width, side * camera.height), -1).reshape(-1, 2)
+    ground = unproject(pixels, np.full(len(pixels), depth), camera, world_from_camera)
+    near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[: CANDIDATES + 1]
+    worth: dict[int, Array] = {}
+    for j in near.tolist():
+        if j == i:
+            continue
+        seen, _ = project(ground, cameras[j], poses[j])
+        with np.errstate(invalid="ignore"):
+            inside = ((seen > 0) & (seen < [cameras[j].width, cameras[j].height])).all(1)
+        here, there = ground - centres[i], ground - centres[j]
+        lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1)
+        cosine = np.einsum("ij,ij->i", here, there) / np.maximum(lengths, 1e-12)
+        base_to_height = 2 * np.tan(np.arccos(np.clip(cosine, -1, 1)) / 2)
+        value = np.where(inside, _value(base_to_height, ratio), 0.0)
+        if value.mean() > 0.02:
+            worth[j] = value
+    chosen: list[int] = []
+    times = np.zeros(len(ground), int)
+    while worth and len(chosen) < count:
+        repeat = np.array([REPEATS[min(t, len(REPEATS) - 1)] for t in times])
+        gains = {j: float((value * repeat).mean()) for j, value in worth.items()}
+        best = max(gains, key=lambda j: (gains[j], -j))
+        if gains[best] < 0.02:
+            break
+        chosen.append(best)
+        times += worth.pop(best) > 0
+    return chosen
+
+
+def _value(base_to_height: Array, ratio: tuple[float, float]) -> Array:
+    """1 between 0.15 and 0.45; less where depth is imprecise (narrow) or views differ too much (wide)."""
+    low, high = ratio
+    rise = np.clip((base_to_height - low) / max(0.15 - low, 1e-9), 0, 1)
+    fall = np.clip(1 - 0.7 * (base_to_height - 0.45) / max(high - 0.45, 1e-9), 0, 1)
+    return np.where(base_to_height > high, 0.0, np.minimum(rise, fall))
