@@ -1,4 +1,4 @@
-"""Train, sweep and compare: `python train.py stage=gan overlap=50`. Everything it can do stands in conf/ and README.md."""
+"""Train, sweep and compare: `python train.py stage=gan overlap=50`; conf/ and README.md say what else it can do."""
 
 import sys
 

@@ -8,12 +8,18 @@ from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
+
 from overfly.run import build, conf_dir, register_resolvers
 
 
 def main() -> None:
     register_resolvers()
-    overrides = ["stage=gan", "run_dir=.", "data.source.images={train: 120, val: 20, test: 0, unseen: 0}", *sys.argv[1:]]
+    overrides = [
+        "stage=gan",
+        "run_dir=.",
+        "data.source.images={train: 120, val: 20, test: 0, unseen: 0}",
+        *sys.argv[1:],
+    ]
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         cfg = compose("train", overrides=[*overrides, f"cache_dir={Path.home() / '.cache/overfly'}"])
     data = build(cfg.data)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+
 from overfly.geometry import Camera, look_at, pixel_grid, rays
 from overfly.scenes import Renderer, make_scene
 

@@ -11,6 +11,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
+
 from overfly.errors import InputError
 from overfly.run import build, check, conf_dir, register_resolvers
 
@@ -68,7 +69,7 @@ def test_every_file_composes_resolves_and_names_real_classes(file: Path) -> None
 def test_every_stage_model_loss_and_callback_is_built(file: Path, tmp_path: Path) -> None:
     group, name = file.parts
     cfg = phase(composed(f"{group}={name}", "trainer.accelerator=cpu", run_dir=str(tmp_path)))
-    if cfg.stage is not None:
+    if "_target_" in cfg.stage:
         build(cfg.stage)
     assert len(list(build(cfg.callbacks).values())) == len(cfg.callbacks)
 
@@ -117,8 +118,8 @@ def test_trainer_flags_that_people_use_need_no_plus() -> None:
 
 @pytest.mark.parametrize(
     ("override", "allowed"),
-    [("overlap=120", "0 to 95"), ("altitude=-5", "20 to 500"), ("overlap=abc", "0 to 95"), ("overlap=[30,99]", "0 to 95"),
-     ("side_overlap=-1", "0 to 95"), ("frames=0", "1 to 8"), ("altitude=true", "20 to 500")],
+    [("overlap=120", "0 to 95"), ("altitude=-5", "20 to 500"), ("overlap=abc", "0 to 95"),
+     ("overlap=[30,99]", "0 to 95"), ("side_overlap=-1", "0 to 95"), ("frames=0", "1 to 8"), ("altitude=true", "20 to 500")],
 )  # fmt: skip
 def test_values_that_no_flight_can_have_are_refused(override: str, allowed: str) -> None:
     with pytest.raises(InputError, match=allowed):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+
 from overfly.errors import InputError
 from overfly.run import load_run
 from overfly.tables import read_rows

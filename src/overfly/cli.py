@@ -45,7 +45,9 @@ def fly(
     camera: Annotated[str, typer.Option(help="A camera: phantom4, p4p, mavic2pro, mavic3e, p1, ...")] = "p4p",
     width: Annotated[int | None, typer.Option(help="Image width, pixels. Default: 800.")] = None,
     height: Annotated[int | None, typer.Option(help="Image height, pixels. Default: by the sensor.")] = None,
-    area: Annotated[float | None, typer.Option(help="Side of the square flown over, metres. Default: 5 x 5 frames.")] = None,
+    area: Annotated[
+        float | None, typer.Option(help="Side of the square flown over, metres. Default: 5 x 5 frames.")
+    ] = None,
     frames: Annotated[int | None, typer.Option(help="At most so many frames.")] = None,
     seed: Annotated[int, typer.Option(help="Of the landscape, the light and the noise.")] = 0,
     noise: Annotated[str, typer.Option(help="Of GPS and gimbal in the images: none, gps, rtk, ...")] = "none",

@@ -74,7 +74,7 @@ def check(cfg: DictConfig) -> None:
         raise InputError(f"frames={cfg.frames} is not possible: a window has 1 to 8 frames, for instance frames=3.")
 
 
-def build(cfg: DictConfig) -> Any:
+def build(cfg: Any) -> Any:
     """Instantiate a part of the configuration, nested parts included: the one call of Hydra's ``instantiate``."""
     from hydra.utils import instantiate
 
@@ -125,7 +125,8 @@ def _train_stage(cfg: DictConfig) -> float | None:
     loggers = list(build(cfg.logger).values())
     try:
         data = build(cfg.data)
-        trainer = build(OmegaConf.merge(cfg.trainer, {"callbacks": list(cfg.callbacks.values())}))
+        callbacks = [part for name, part in cfg.callbacks.items() if name != "progress" or _shows_progress(cfg)]
+        trainer = build(OmegaConf.merge(cfg.trainer, {"callbacks": callbacks}))
         trainer.loggers = [] if trainer.fast_dev_run else loggers
         last = run_dir / "checkpoints" / "last.ckpt"
         if cfg.resume and last.is_file():
@@ -138,10 +139,18 @@ def _train_stage(cfg: DictConfig) -> float | None:
         best, monitored = _best(trainer, cfg.monitor, metrics)
         if cfg.test and data.has_test:
             results = trainer.test(stage, datamodule=data, ckpt_path=best, verbose=False, weights_only=True)
-            metrics |= _by_split(results, data.test_splits)
+            metrics |= _merged(results)
         if trainer.is_global_zero:
-            _write_json(run_dir / "metrics.json", {"stage": cfg.stage_name, "monitor": cfg.monitor,
-                        "monitored": monitored, "epochs": trainer.current_epoch, "metrics": metrics})
+            _write_json(
+                run_dir / "metrics.json",
+                {
+                    "stage": cfg.stage_name,
+                    "monitor": cfg.monitor,
+                    "monitored": monitored,
+                    "epochs": trainer.current_epoch,
+                    "metrics": metrics,
+                },
+            )
         shown = "was not measured" if monitored is None else f"is {monitored:.5g}"
         log.info("%s: the best %s %s", cfg.stage_name, cfg.monitor, shown)
         return monitored
@@ -181,14 +190,14 @@ def _compare(cfg: DictConfig, run_dir: Path) -> float | None:
     return float(own[0]["chamfer_m2"]) if own else None
 
 
-def _by_split(results: Sequence[Mapping[str, float]], splits: Sequence[str]) -> dict[str, float]:
-    """Lightning's test results, one dict a loader, under the names of the splits: ``test/...`` and ``unseen/...``."""
-    named = {}
-    for split, result in zip(splits, results, strict=True):
-        for key, value in result.items():
-            what = key.removeprefix("test/").split("/dataloader_idx_")[0]
-            named[f"{split}/{what}"] = float(value)
-    return named
+def _shows_progress(cfg: DictConfig) -> bool:
+    """Whether there is a progress bar: Lightning refuses one that is configured and switched off."""
+    return bool(cfg.trainer.enable_progress_bar)
+
+
+def _merged(results: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Lightning's test results, one dict a loader; the stages name the splits: ``test/...`` and ``unseen/...``."""
+    return {key.split("/dataloader_idx_")[0]: float(value) for result in results for key, value in result.items()}
 
 
 def _quieten() -> None:
@@ -206,7 +215,8 @@ def _quieten() -> None:
 def _best(trainer: Any, monitor: str, metrics: dict[str, float]) -> tuple[str | None, float | None]:
     """The best checkpoint (None under fast_dev_run: the weights in memory) and its monitored value."""
     callback = trainer.checkpoint_callback
-    if trainer.fast_dev_run or callback is None or not callback.best_model_path:
+    scored = callback is not None and callback.best_model_path and callback.best_model_score is not None
+    if trainer.fast_dev_run or not scored:
         value = metrics.get(monitor)
         return None, value if value is not None and math.isfinite(value) else None
     return callback.best_model_path, float(callback.best_model_score)
@@ -268,7 +278,9 @@ def load_run(folder: Path | str) -> Run:
     """
     path = checkpoint(Path(folder))
     if path is None:
-        raise InputError(f"{folder} holds no checkpoints/best.ckpt: train first (python train.py), then give its run folder.")
+        raise InputError(
+            f"{folder} holds no checkpoints/best.ckpt: train first (python train.py), then give its run folder."
+        )
     register_resolvers()
     root = path.parent.parent
     cfg = OmegaConf.load(root / "config.yaml")
@@ -287,6 +299,7 @@ def _save_config(cfg: DictConfig, folder: Path) -> None:
     from hydra.core.hydra_config import HydraConfig
 
     resolved = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
+    assert isinstance(resolved, DictConfig)
     OmegaConf.set_struct(resolved, False)
     for key in ("phases", "sweep"):
         resolved.pop(key, None)
@@ -309,8 +322,15 @@ def _collect(run_dir: Path, phases: list[str]) -> None:
     results = {name: json.loads((run_dir / name / "metrics.json").read_text()) for name in finished}
     if not results:
         return
-    _write_json(run_dir / "metrics.json", {"stage": "all", "monitored": results[finished[-1]]["monitored"],
-                "monitor": results[finished[-1]]["monitor"], "phases": results})
+    _write_json(
+        run_dir / "metrics.json",
+        {
+            "stage": "all",
+            "monitored": results[finished[-1]]["monitored"],
+            "monitor": results[finished[-1]]["monitor"],
+            "phases": results,
+        },
+    )
     rows = {name: read_rows(run_dir / name / "metrics.csv") for name in finished}
     lines: list[dict[str, Any]] = [{"stage": name, **row} for name, part in rows.items() for row in part]
     if lines:
@@ -372,7 +392,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.argv = ["train.py", *_resumed(sys.argv[1:] if argv is None else argv)]
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")(train)()
     except KeyboardInterrupt:
-        print("Stopped. What is finished is kept; resume=<the run folder> goes on from the last epoch.", file=sys.stderr)
+        print(
+            "Stopped. What is finished is kept; resume=<the run folder> goes on from the last epoch.", file=sys.stderr
+        )
         return 130
     except Exception as error:
         sentence = explain(error)

@@ -13,7 +13,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from overfly.tables import markdown, write_rows
 
@@ -31,7 +31,7 @@ class SweepSummary(Callback):
     """
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
-        if "num" not in HydraConfig.get().job:  # a single run
+        if OmegaConf.is_missing(HydraConfig.get().job, "num"):  # a single run
             return
         failed = job_return.status is JobStatus.FAILED
         error = job_return._return_value if failed else None

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from plane import make_record
+
 from overfly.data.record import write_record
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from overfly.data.record import Record
 from overfly.geometry import Camera, pixel_grid, pose, rays, rotation_from_gimbal
 

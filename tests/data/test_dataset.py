@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from plane import CAMERA, make_record, surface
+
 from overfly.data.dataset import WindowDataset, WindowSampler, WindowSettings, reference_points
 from overfly.data.record import write_record
 from overfly.data.windows import to_world, window_frame

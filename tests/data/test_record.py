@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plane import make_record, surface
+
 from overfly.data.record import cached, read_record, write_record
 from overfly.errors import InputError
 
@@ -32,7 +33,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_half_record(tmp_path: Path, m
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("overfly.data.record.np.save", full)
-    with pytest.raises(InputError, match="is full.*cache_dir"):
+    with pytest.raises(InputError, match=r"is full.*cache_dir"):
         write_record(make_record(), tmp_path / "flight")
     assert list(tmp_path.iterdir()) == []
 

@@ -11,6 +11,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from overfly.tables import Row, read_rows, write_rows
 
+
 class MetricsCsv(Logger):
     """``metrics.csv`` in the run folder: one line an epoch, one column a metric.
 
@@ -54,4 +55,4 @@ def finish_loggers(loggers: Iterable[Logger]) -> None:
         if type(logger).__name__ == "WandbLogger":
             import wandb
 
-            wandb.finish(quiet=True)
+            wandb.finish()

@@ -153,6 +153,5 @@ def _shift(scene: Scene, flight: Flight) -> NDArray[np.float64]:
     from overfly.geometry import enu_from_geodetic
 
     place = scene.origin
-    there = enu_from_geodetic([[place.latitude, place.longitude, place.height]], flight.origin)[0]
     # Both frames point east, north, up; over one flight the axes of two places differ by less than 1 mm a metre.
-    return there
+    return enu_from_geodetic([[place.latitude, place.longitude, place.height]], flight.origin)[0]

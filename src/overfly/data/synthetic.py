@@ -161,9 +161,7 @@ class SyntheticFlights:
         jobs = self.jobs(split)[:limit]
         folders = [self.folder / job.key for job in jobs]
         missing = [
-            (job, folder)
-            for job, folder in zip(jobs, folders, strict=True)
-            if not (folder / "record.json").is_file()
+            (job, folder) for job, folder in zip(jobs, folders, strict=True) if not (folder / "record.json").is_file()
         ]
         if missing:
             self._render(split, missing)
@@ -253,8 +251,8 @@ def record_flight(job: FlightJob) -> Record:
         frames += len(plan)
     if frames < job.images:
         raise InputError(
-            f"A {job.flight_path['name']} flight at {job.altitude:g} m with {job.overlap:g} % overlap has only {frames} "
-            f"frames in this scene: ask for at most {frames} images_per_flight."
+            f"A {job.flight_path['name']} flight at {job.altitude:g} m with {job.overlap:g} % overlap has only "
+            f"{frames} frames in this scene: ask for at most {frames} images_per_flight."
         )
     poses = np.concatenate([plan.world_from_camera for plan in plans])[: job.images]
     strips = np.concatenate([1000 * i + plan.strip for i, plan in enumerate(plans)])[: job.images]

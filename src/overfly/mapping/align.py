@@ -1,9 +1,8 @@
-"""Cameras estimated from the images: SIFT, two-view geometry, global mapping, bundle adjustment held by GPS."""
+"""Cameras estimated from the images: SIFT, verified matches, global mapping, bundle adjustment held by GPS."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -12,17 +11,26 @@ from typing import Any
 import numpy as np
 
 from overfly.errors import InputError
-from overfly.flights import Flight, Frame, find_preset
-from overfly.geometry import Array, Camera, Origin, enu_from_geodetic, pose, transform
+from overfly.flights import Flight, Frame
+from overfly.geometry import Array, Camera, Origin, enu_from_geodetic, pose
 from overfly.mapping.block import Block
-from overfly.mapping.features import FEWEST_MATCHES, features, image_pairs, match
-from overfly.mapping.georeference import by_gps, by_ground
-
-log = logging.getLogger("overfly")
+from overfly.mapping.database import focal_px, match_pairs, open_database, strongest_pair
+from overfly.mapping.features import features, image_pairs
+from overfly.mapping.georeference import by_gps, by_ground, level_line, on_a_line
+from overfly.mapping.model import adjust, centres_and_rotations, mapped, moved
 
 Bar = Callable[[str, str], AbstractContextManager[Callable[..., Any]]]
-DIAGONAL_MM = 43.267
-GPS_SIGMA_M = (2.0, 2.0, 3.0)
+
+GPS_SIGMA_M = (0.5, 0.5)
+"""Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""
+
+BAROMETER_SIGMA_M = 0.12
+"""The same of a height that the drone's barometer holds (frames with a relative altitude)."""
+
+FAR_OFF_M = 8.0
+"""A frame at least this far (and six times the median) off the common fit has a wrong GPS position."""
+
+FOCAL_DRIFT = 0.1
 
 
 def align(flight: Flight, *, workdir: Path, seed: int, bar: Bar) -> Block:
@@ -30,7 +38,7 @@ def align(flight: Flight, *, workdir: Path, seed: int, bar: Bar) -> Block:
 
     Args:
         flight: frames with GPS and focal lengths where their files tell them; cameras they may have are not used.
-        workdir: features, matches and the sparse model are kept here.
+        workdir: features, matches and the sparse model are kept here, and reused.
         seed: of every random choice; the same seed gives the same cameras.
         bar: (step, unit) -> context manager of a function that takes (done, total).
 
@@ -43,35 +51,35 @@ def align(flight: Flight, *, workdir: Path, seed: int, bar: Bar) -> Block:
     """
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
-    frames = flight.frames
+    # Warnings of the sparse solver speak of its inside; what matters is said in the block's own warnings.
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    if len(flight.frames) < 2:
+        raise InputError(f"Cameras cannot be estimated from {len(flight.frames)} image: give two or more that overlap.")
+    workdir.mkdir(parents=True, exist_ok=True)
     warnings: list[str] = []
     origin, told = gps_frame(flight)
-    pixels, pairs = _matched(frames, told, workdir, bar)
-    database = workdir / "database.db"
-    database.unlink(missing_ok=True)
-    guessed = _fill(database, frames, pixels, pairs)
+    database, guessed = _matched(flight, told, workdir, seed, bar)
     if guessed:
         warnings.append(
-            "The focal length of some images is not known and was estimated from the images alone: calibrate the "
-            "camera or keep the photos' EXIF."
+            f"The focal length of {len(guessed)} images is not known and was estimated from the images alone: "
+            "keep the photos' EXIF, or give a calibrated camera."
         )
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = seed
-    pycolmap.geometric_verification(database, two_view_geometry_options=options)
-    model = _mapped(database, flight.root, workdir, seed)
-    if model is None or model.num_reg_images() < 2:
-        strongest = max((len(m) for m in pairs.values()), default=0)
-        raise InputError(
-            f"No two of the {len(frames)} images could be placed together (best pair: {strongest} matches): give images "
-            "that overlap by 30 % or more, are sharp, and show texture."
-        )
-    ids = sorted(model.reg_image_ids())
-    index = {frame.name: i for i, frame in enumerate(frames)}
-    order = [index[model.images[i].name] for i in ids]
-    if told is not None and np.isfinite(told[order, :2]).all(1).sum() >= 3:
-        model = _held(model, ids, told[order], [frames[i].gimbal for i in order], seed)
-    return _block(flight, model, ids, order, origin, told, warnings, seed)
+    with bar("cameras", "models") as update:
+        model = mapped(database, flight.root, workdir, total=len(flight), seed=seed)
+        update(1, 2)
+        if model is None or model.num_reg_images() < 2:
+            raise InputError(
+                f"No two of the {len(flight)} images could be placed together (best pair: "
+                f"{strongest_pair(database)} common points, 15 needed): give sharp images that overlap by 30 % or more."
+            )
+        ids = sorted(model.reg_image_ids())
+        index = {frame.name: i for i, frame in enumerate(flight.frames)}
+        order = [index[model.images[i].name] for i in ids]
+        registered = [flight.frames[i] for i in order]
+        model, metric = _placed(model, ids, registered, None if told is None else told[order], warnings, seed)
+        update(2, 2)
+    _remark_focal(model, ids, registered, warnings)
+    return _block(model, ids, registered, order, origin if metric else None, metric, warnings)
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
@@ -80,12 +88,8 @@ def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
     known = [fix for fix in fixes if fix is not None]
     if len(known) < 2:
         return None, None
-    heights = [fix.altitude for fix in known if fix.altitude is not None]
-    origin = flight.origin or Origin(
-        float(np.mean([fix.latitude for fix in known])),
-        float(np.mean([fix.longitude for fix in known])),
-        float(np.median(heights)) if heights else 0.0,
-    )
+    origin = flight.origin or flight.gps_origin()
+    assert origin is not None
     told = np.full((len(fixes), 3), np.nan)
     for i, fix in enumerate(fixes):
         if fix is not None:
@@ -95,220 +99,104 @@ def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
     return origin, told
 
 
-def focal_px(frame: Frame) -> float | None:
-    """Focal length in pixels by the camera's data sheet, the EXIF focal-plane tags or the 35 mm equivalent."""
-    longest = max(frame.width, frame.height)
-    if frame.model and frame.focal_mm:
-        try:
-            preset = find_preset(frame.model)
-            return float(frame.focal_mm / preset.sensor_mm[0] * longest)
-        except InputError:
-            pass  # a camera without a data sheet here
-    if frame.focal_px:
-        return float(frame.focal_px)
-    if frame.focal35_mm:
-        return float(frame.focal35_mm / DIAGONAL_MM * np.hypot(frame.width, frame.height))
-    return None
-
-
-def _matched(
-    frames: list[Frame], told: Array | None, workdir: Path, bar: Bar
-) -> tuple[list[Any], dict[tuple[int, int], Any]]:
-    """Key points of every frame and the matches of every pair, kept in ``workdir``."""
+def _matched(flight: Flight, told: Array | None, workdir: Path, seed: int, bar: Bar) -> tuple[Path, list[str]]:
+    """The database with verified matches, and the frames whose focal length is a guess."""
     folder = workdir / "features"
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(exist_ok=True)
     found = []
     with bar("features", "images") as update:
-        for i, frame in enumerate(frames):
+        for i, frame in enumerate(flight.frames):
             found.append(features(frame, folder))
-            update(i + 1, len(frames))
-    pairs: dict[tuple[int, int], Any] = {}
-    wanted = image_pairs(frames, told)
+            update(i + 1, len(flight))
+    database = workdir / "matches.db"
+    _, guessed = open_database(database, flight, found)
+    with bar("pairs", "images") as update:
+        pairs = image_pairs(told, [descriptors for _, descriptors in found], update)
     with bar("matches", "pairs") as update:
-        for number, (i, j) in enumerate(wanted):
-            kept = folder / f"match-{i}-{j}.npy"
-            if kept.is_file():
-                pairs[i, j] = np.load(kept)
-            else:
-                pairs[i, j] = match(found[i][1], found[j][1])
-                part = kept.with_suffix(".part")
-                with part.open("wb") as file:
-                    np.save(file, pairs[i, j])
-                part.replace(kept)
-            update(number + 1, len(wanted))
-    return [pixels for pixels, _ in found], pairs
+        match_pairs(database, [f.name for f in flight.frames], pairs, seed=seed, progress=update)
+    return database, guessed
 
 
-def _fill(database: Path, frames: list[Frame], pixels: list[Any], pairs: dict[tuple[int, int], Any]) -> bool:
-    """Write cameras, key points and matches; returns whether a focal length had to be guessed."""
-    import pycolmap
-
-    cameras: dict[Hashable, Any] = {}
-    guessed = False
-    with pycolmap.Database.open(database) as db:
-        ids = []
-        for frame, points in zip(frames, pixels, strict=True):
-            key = frame.camera_key
-            if key not in cameras:
-                prior = focal_px(frame)
-                guessed |= prior is None
-                focal = prior or 1.2 * max(frame.width, frame.height)
-                camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", focal, frame.width, frame.height)
-                camera.has_prior_focal_length = prior is not None
-                camera.camera_id = db.write_camera(camera)
-                rig = pycolmap.Rig()
-                rig.add_ref_sensor(camera.sensor_id)
-                cameras[key] = (camera.camera_id, db.write_rig(rig))
-            camera_id, rig_id = cameras[key]
-            image = pycolmap.Image(name=frame.name, camera_id=camera_id)
-            image.image_id = db.write_image(image)
-            unit = pycolmap.Frame()
-            unit.rig_id = rig_id
-            unit.add_data_id(image.data_id)
-            db.write_frame(unit)
-            db.write_keypoints(image.image_id, points.astype(np.float32))
-            ids.append(image.image_id)
-        for (i, j), matches in pairs.items():
-            if len(matches) >= FEWEST_MATCHES:
-                db.write_matches(ids[i], ids[j], matches)
-    return guessed
-
-
-def _mapped(database: Path, images: Path, workdir: Path, seed: int) -> Any:
-    """The largest model of global mapping; where it leaves images out, incremental mapping may do better."""
-    import pycolmap
-
-    options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = seed
-    # At 30 % overlap most ground is seen twice only: two-view tracks are all there is.
-    options.mapper.track_min_num_views_per_track = 2
-    options.mapper.retriangulation.ignore_two_view_tracks = False
-    options.mapper.global_positioning.min_num_view_per_track = 2
-    options.mapper.bundle_adjustment.min_track_length = 2
-    best = _largest(_quiet(lambda: pycolmap.global_mapping(database, images, _folder(workdir / "global"), options)))
-    with pycolmap.Database.open(database) as db:
-        wanted = db.num_images()
-    if best is None or best.num_reg_images() < wanted:
-        pipeline = pycolmap.IncrementalPipelineOptions()
-        pipeline.random_seed = seed
-        pipeline.ba_refine_focal_length = True
-        pipeline.min_num_matches = FEWEST_MATCHES
-        pipeline.triangulation.ignore_two_view_tracks = False
-        grown = _largest(
-            _quiet(lambda: pycolmap.incremental_mapping(database, images, _folder(workdir / "incremental"), pipeline))
-        )
-        if grown is not None and (best is None or grown.num_reg_images() > best.num_reg_images()):
-            best = grown
-    return best
-
-
-def _quiet(run: Callable[[], dict[int, Any]]) -> dict[int, Any]:
-    """No model at all is an answer, which pycolmap gives as an exception."""
-    try:
-        return run()
-    except (RuntimeError, ValueError) as error:
-        log.debug("mapping found no model: %s", error)
-        return {}
-
-
-def _folder(path: Path) -> Path:
-    path.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def _largest(models: dict[int, Any]) -> Any:
-    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-
-
-def _held(model: Any, ids: list[int], told: Array, gimbals: list[Any], seed: int) -> Any:
-    """Bundle adjustment with GPS positions as priors: it holds scale and tilt, which images alone bend."""
-    import pycolmap
-
-    centres = np.array([model.images[i].projection_center() for i in ids])
-    try:
-        matrix = by_gps(centres, told, gimbals, _rotations(model, ids))
-    except InputError:
-        return model
-    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
-    rows = np.column_stack([matrix[:3, :3] / scale, matrix[:3, 3]])
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(rows[:, :3]), rows[:, 3]))
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 0.5
-    options.ceres.solver_options.max_num_iterations = 150
-    config = pycolmap.BundleAdjustmentConfig()
-    priors = []
-    for i, place in zip(ids, told, strict=True):
-        config.add_image(i)
-        if np.isfinite(place).all():
-            prior = pycolmap.PosePrior()
-            prior.corr_data_id = model.images[i].data_id
-            prior.position = place
-            prior.position_covariance = np.diag(np.square(GPS_SIGMA_M))
-            prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
-            priors.append(prior)
-    if len(priors) < 3:
-        return model
-    held = pycolmap.PosePriorBundleAdjustmentOptions()
-    held.alignment_ransac.random_seed = seed
-    held.alignment_ransac.max_error = 10.0
-    held.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.HUBER
-    refined = pycolmap.Reconstruction(model)
-    pycolmap.create_pose_prior_bundle_adjuster(options, held, config, priors, refined).solve()
-    refined.update_point_3d_errors()
-    model.update_point_3d_errors()
-    # GPS may bend the block by half a pixel; more would mean that the positions are wrong.
-    if refined.compute_mean_reprojection_error() > model.compute_mean_reprojection_error() + 0.5:
-        return model
-    return refined
-
-
-def _rotations(model: Any, ids: list[int]) -> Array:
-    """Model-from-camera rotations [n, 3, 3]."""
-    return np.stack([model.images[i].cam_from_world().rotation.matrix().T for i in ids])
-
-
-def _block(
-    flight: Flight,
-    model: Any,
-    ids: list[int],
-    order: list[int],
-    origin: Origin | None,
-    told: Array | None,
-    warnings: list[str],
-    seed: int,
-) -> Block:
-    centres = np.array([model.images[i].projection_center() for i in ids])
-    rotations = _rotations(model, ids)
-    tracked = [p for p in model.points3D.values() if p.error < 2]
-    points = np.array([p.xyz for p in tracked]).reshape(-1, 3)
-    metric = False
+def _placed(
+    model: Any, ids: list[int], frames: list[Frame], told: Array | None, warnings: list[str], seed: int
+) -> tuple[Any, bool]:
+    """The adjusted model in its final frame, and whether that is metric."""
+    gimbals = [frame.gimbal for frame in frames]
+    centres, rotations = centres_and_rotations(model, ids)
     matrix = None
     if told is not None:
         try:
-            matrix = by_gps(centres, told[order], [flight.frames[i].gimbal for i in order], rotations)
-            metric = True
+            matrix = by_gps(centres, told, gimbals, rotations)
         except InputError as error:
             warnings.append(f"{error} The map has no metric scale.")
-    if matrix is None:
-        matrix = by_ground(centres, points, rotations, seed)
-    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+    if matrix is None or told is None:
+        model = adjust(model, ids, None, None, seed=seed)
+        centres, rotations = centres_and_rotations(model, ids)
+        points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
+        return moved(model, by_ground(centres, points, rotations, seed)), False
+    model = moved(model, matrix)
+    away = centres_and_rotations(model, ids)[0] - told
+    away[:, 2] = np.nan_to_num(away[:, 2])
+    distance = np.linalg.norm(away, axis=1)
+    wrong = distance > max(FAR_OFF_M, 6 * float(np.nanmedian(distance)))
+    if wrong.any():
+        names = ", ".join(frames[k].name for k in np.flatnonzero(wrong)[:5])
+        warnings.append(f"The GPS position of {int(wrong.sum())} images is far off and was not used: {names}.")
+    places, sigmas = np.where(wrong[:, None], np.nan, told), _sigmas(frames)
+    if np.isnan(places[:, 2]).all():
+        places[:, 2], sigmas[:, 2] = centres_and_rotations(model, ids)[0][:, 2], 1e3
+    model = adjust(model, ids, places, sigmas, seed=seed)
+    if on_a_line(told):
+        # GPS along a line holds the ends only: the block may have rolled about it.
+        centres, rotations = centres_and_rotations(model, ids)
+        model = moved(model, level_line(centres, gimbals, rotations))
+    return model, True
+
+
+def _sigmas(frames: list[Frame]) -> Array:
+    """Standard deviations [n, 3] of the frames' GPS positions, metres."""
+    barometer = all(frame.relative_altitude is not None for frame in frames)
+    rows = []
+    for frame in frames:
+        stated = (frame.gps.horizontal_m, frame.gps.vertical_m) if frame.gps else (None, None)
+        flat = stated[0] or GPS_SIGMA_M[0]
+        rows.append([flat, flat, stated[1] or (BAROMETER_SIGMA_M if barometer else GPS_SIGMA_M[1])])
+    return np.array(rows)
+
+
+def _remark_focal(model: Any, ids: list[int], frames: list[Frame], warnings: list[str]) -> None:
+    """Say where the images and the photo's own data disagree about the focal length."""
+    for i in {model.images[i].camera_id: i for i in ids}.values():
+        prior, found = focal_px(frames[ids.index(i)]), float(model.images[i].camera.params[0])
+        if prior and abs(found / prior - 1) > FOCAL_DRIFT:
+            warnings.append(
+                f"The focal length came out as {found:.0f} px, the photos' data say {prior:.0f} px: heights may be "
+                f"wrong by up to {100 * abs(found / prior - 1):.0f} % where the overlap is weak."
+            )
+
+
+def _block(
+    model: Any,
+    ids: list[int],
+    frames: list[Frame],
+    order: list[int],
+    origin: Origin | None,
+    metric: bool,
+    warnings: list[str],
+) -> Block:
+    centres, rotations = centres_and_rotations(model, ids)
     placed: dict[int, Frame] = {}
-    for i, number, centre, rotation in zip(ids, order, centres, rotations, strict=True):
-        frame = flight.frames[number]
-        f, cx, cy, k1 = model.images[i].camera.params
-        placed[number] = replace(
-            frame,
-            camera=Camera(frame.width, frame.height, f, f, cx, cy, k1=k1),
-            world_from_camera=pose(matrix[:3, :3] / scale @ rotation, transform(matrix, centre)),
-        )
+    for i, number, frame, centre, rotation in zip(ids, order, frames, centres, rotations, strict=True):
+        f, cx, cy, k1, k2 = (float(v) for v in model.images[i].camera.params)
+        camera = Camera(frame.width, frame.height, f, f, cx, cy, k1=k1, k2=k2)
+        placed[number] = replace(frame, camera=camera, world_from_camera=pose(rotation, centre))
+    points = np.array([p.xyz for p in model.points3D.values() if p.error < 2]).reshape(-1, 3)
     return Block(
         frames=[placed[number] for number in sorted(placed)],
-        origin=origin if metric else None,
+        origin=origin,
         cameras_from="estimated",
         metric=metric,
         reprojection_px=float(model.compute_mean_reprojection_error()),
-        points=transform(matrix, points),
+        points=points,
         warnings=warnings,
     )

@@ -44,7 +44,9 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
             layout = rectify((cameras[0], cameras[1]), (poses[0], poses[1]), (span, span))
             if layout is None:
                 continue
-            gray = [cv2.resize(_gray(f), (c.width, c.height), interpolation=cv2.INTER_AREA) for f, c in zip(pair, cameras)]
+            gray = [
+                cv2.resize(_gray(f), (c.width, c.height), interpolation=cv2.INTER_AREA) for f, c in zip(pair, cameras)
+            ]
             match = disparities((gray[0], gray[1]), (cameras[0], cameras[1]), (poses[0], poses[1]), layout)
             if (match != UNKNOWN).mean() < 0.02:
                 continue

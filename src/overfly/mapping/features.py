@@ -1,7 +1,8 @@
-"""SIFT key points, the pairs of images worth comparing, and their matches."""
+"""SIFT key points of a frame, and the pairs of frames worth matching."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +12,30 @@ from overfly.flights import Frame
 from overfly.geometry import Array
 
 FEATURES = 5000
-LONGEST_SIDE = 2000
-RATIO = 0.8
-FEWEST_MATCHES = 15
-SMALL_FLIGHT = 45
-NEIGHBOURS = 12
+LONGEST_SIDE = 1600
+NEIGHBOURS = 3
+"""Nearest frames in each of eight directions that a frame is matched with."""
+
+COARSE_FEATURES = 600
+COARSE_RATIO = 0.8
+FEWEST_COARSE = 5
+MOST_PARTNERS = 14
+SMALL_FLIGHT = 8
+"""Up to this many frames all pairs are matched."""
 
 
-def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Pixels [n, 2] (centres at +0.5) and RootSIFT descriptors [n, 128]; kept in ``folder`` for the next call."""
+def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Pixels [n, 2] (centres at +0.5) and RootSIFT descriptors [n, 128], the coarsest first; kept in ``folder``.
+
+    Lowe, "Distinctive image features from scale-invariant keypoints" (2004); square roots after Arandjelović &
+    Zisserman (2012), scaled to bytes as COLMAP expects them.
+    """
     import cv2
 
     kept = folder / f"{frame.name.replace('/', '_')}.npz"
     if kept.is_file():
         with np.load(kept) as data:
-            return data["pixels"], data["descriptors"].astype(np.float32) / 512
+            return data["pixels"], data["descriptors"]
     gray = cv2.cvtColor(frame.image(), cv2.COLOR_RGB2GRAY)
     factor = min(1.0, LONGEST_SIDE / max(gray.shape))
     if factor < 1:
@@ -33,59 +43,91 @@ def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[n
     # A low contrast threshold: meadows and asphalt have key points too, and the strongest are chosen anyway.
     sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
     found, raw = sift.detectAndCompute(gray, None)
-    pixels = (np.array([point.pt for point in found], np.float32).reshape(-1, 2) + 0.5) / np.float32(factor)
-    root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9)) if len(found) else np.zeros((0, 128))
-    # A tie at the last place lets SIFT return one more; half precision of 512 steps halves the file.
-    pixels, root = pixels[:FEATURES], root[:FEATURES].astype(np.float32)
-    part = kept.with_suffix(".part.npz")
-    np.savez(part, pixels=pixels, descriptors=np.round(root * 512).astype(np.uint16))
+    if len(found):
+        order = np.argsort([-point.size for point in found], kind="stable")[:FEATURES]
+        places = np.array([point.pt for point in found], np.float32)[order]
+        pixels = (places + 0.5) / np.float32(factor)
+        root = np.sqrt(raw[order] / np.maximum(raw[order].sum(1, keepdims=True), 1e-9))
+        descriptors = np.clip(np.round(512 * root), 0, 255).astype(np.uint8)
+    else:
+        pixels, descriptors = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
+    part = kept.with_suffix(".part")
+    with part.open("wb") as file:
+        np.savez(file, pixels=pixels, descriptors=descriptors)
     part.replace(kept)
-    return pixels, np.round(root * 512).astype(np.float32) / 512
+    return pixels, descriptors
 
 
-def match(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """Mutual nearest neighbours that pass the ratio test: index pairs [m, 2].
+def image_pairs(
+    positions: Array | None,
+    descriptors: Sequence[NDArray[np.uint8]],
+    progress: Callable[[int, int], None] | None = None,
+) -> list[tuple[int, int]]:
+    """Which frames to match, as sorted pairs i < j.
 
-    Lowe, "Distinctive image features from scale-invariant keypoints" (2004), section 7.1.
+    Args:
+        positions: [n, 3] local GPS positions, NaN where a frame has none; None without GPS.
+        descriptors: of n frames in the order of the flight, the coarsest first.
+        progress: called with (coarse pairs compared, in all), where that is needed.
+
+    Frames with GPS get the nearest others in each of eight directions, so that strips connect; frames without are
+    compared with all others by their few hundred coarsest key points. Neighbours in time are always matched.
     """
+    n = len(descriptors)
+    if n <= SMALL_FLIGHT:
+        return [(i, j) for i in range(n) for j in range(i + 1, n)]
+    pairs = {(i, j) for i in range(n) for j in range(i + 1, min(n, i + 3))}
+    known = np.zeros(n, bool) if positions is None else np.isfinite(positions[:, :2]).all(1)
+    if positions is not None:
+        places = np.flatnonzero(known)
+        for i in places:
+            away = positions[places, :2] - positions[i, :2]
+            distance = np.linalg.norm(away, axis=1)
+            sector = np.floor((np.arctan2(away[:, 1], away[:, 0]) / np.pi + 1) * 4).astype(int) % 8
+            for s in range(8):
+                inside = np.flatnonzero((sector == s) & (places != i))
+                for j in places[inside[np.argsort(distance[inside], kind="stable")[:NEIGHBOURS]]]:
+                    pairs.add((int(min(i, j)), int(max(i, j))))
+    blind = np.flatnonzero(~known).tolist()
+    if blind:
+        pairs |= _alike(blind, descriptors, progress)
+    return sorted(pairs)
+
+
+def _alike(
+    asking: list[int], descriptors: Sequence[NDArray[np.uint8]], progress: Callable[[int, int], None] | None
+) -> set[tuple[int, int]]:
+    """Pairs that share coarse key points: the best partners of each asking frame among all frames."""
+    units = []
+    for raw in descriptors:
+        few = raw[:COARSE_FEATURES].astype(np.float32)
+        units.append(few / np.maximum(np.linalg.norm(few, axis=1, keepdims=True), 1e-9))
+    n = len(units)
+    counts = np.zeros((n, n), int)
+    asked = set(asking)
+    for done, i in enumerate(asking):
+        for j in range(n):
+            if j != i and not (j in asked and j < i):
+                counts[i, j] = counts[j, i] = _count_matches(units[i], units[j])
+        if progress:
+            progress(done + 1, len(asking))
+    pairs = set()
+    for i in asking:
+        for j in np.argsort(-counts[i], kind="stable")[:MOST_PARTNERS].tolist():
+            if counts[i, j] >= FEWEST_COARSE:
+                pairs.add((min(i, j), max(i, j)))
+    return pairs
+
+
+def _count_matches(a: NDArray[np.float32], b: NDArray[np.float32]) -> int:
+    """Mutual nearest neighbours that pass the ratio test."""
     if min(len(a), len(b)) < 2:
-        return np.zeros((0, 2), np.uint32)
+        return 0
     similarity = a @ b.T
     rows = np.arange(len(a))
     best = similarity.argmax(1)
-    first = similarity[rows, best]
     mutual = similarity.argmax(0)[best] == rows
+    first = similarity[rows, best]
     similarity[rows, best] = -1
-    second = similarity.max(1)
     # Unit vectors: squared distance = 2 - 2 cos.
-    good = mutual & (2 - 2 * first < RATIO**2 * (2 - 2 * second))
-    return np.stack([rows[good], best[good]], axis=1).astype(np.uint32)
-
-
-def image_pairs(frames: list[Frame], positions: Array | None) -> list[tuple[int, int]]:
-    """Which images to compare.
-
-    Args:
-        frames: n frames in the order of the flight.
-        positions: [n, 3] local GPS positions, NaN where a frame has none; None without GPS.
-
-    Returns:
-        Pairs i < j: all of a small flight without GPS; the nearest in plan and the neighbours in time with GPS;
-        neighbours in time and a coarse net of all others in a large flight without.
-    """
-    n = len(frames)
-    if n <= 12 or (positions is None and n <= SMALL_FLIGHT):
-        return [(i, j) for i in range(n) for j in range(i + 1, n)]
-    pairs = {(i, j) for i in range(n) for j in range(i + 1, min(n, i + 4))}
-    if positions is None:
-        pairs |= {(i, j) for i in range(n) for j in range(i + 1, min(n, i + 11))}
-        net = range(0, n, max(1, n // SMALL_FLIGHT))
-        return sorted(pairs | {(i, j) for i in net for j in net if i < j})
-    known = np.flatnonzero(np.isfinite(positions[:, :2]).all(1))
-    for i in known:
-        away = np.linalg.norm(positions[known, :2] - positions[i, :2], axis=1)
-        for j in known[np.argsort(away, kind="stable")[1 : NEIGHBOURS + 1]]:
-            pairs.add((int(min(i, j)), int(max(i, j))))
-    for i in set(range(n)) - set(known.tolist()):
-        pairs |= {(min(i, j), max(i, j)) for j in range(n) if j != i and abs(i - j) <= 10}
-    return sorted(pairs)
+    return int((mutual & (1 - first < COARSE_RATIO**2 * (1 - similarity.max(1)))).sum())

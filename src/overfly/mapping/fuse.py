@@ -113,13 +113,17 @@ def _points(
     sigma = data["sigma"]
     weight = 1 / sigma**2
     total, mean = weight.copy(), weight * depth
-    agree = np.zeros(depth.shape, np.uint8)
+    agree, deny, seen = (np.zeros(depth.shape, np.uint8) for _ in range(3))
     taken = np.zeros(depth.shape, bool)
     for j, other in partners.items():
-        found, spread, given = _look_up(own, depth, depth_maps[j], other, used.get(j))
+        found, spread, given, inside = _look_up(own, depth, depth_maps[j], other, used.get(j))
         with np.errstate(invalid="ignore"):
-            same = np.abs(found - depth) < GATE * np.hypot(sigma, spread)
+            gate = GATE * np.hypot(sigma, spread)
+            same = np.abs(found - depth) < gate
+            # The other frame looks through this point at something behind it.
+            deny += found - depth > gate
         agree += same
+        seen += inside
         taken |= same & given
         w = np.where(same, 1 / spread**2, 0)
         total += w
@@ -147,8 +151,9 @@ def _points(
 
 def _look_up(
     own: DepthMap, depth: Map, other: DepthMap, data: Mapping[str, NDArray], given: NDArray[np.bool_] | None
-) -> tuple[Map, Map, NDArray[np.bool_]]:
-    """What another map says of each pixel: its depth as a depth of this frame, its sigma, and whether it is given."""
+) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_]]:
+    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given, and
+    whether the other frame has the place inside at all."""
     import cv2
 
     q, t = frame_to_frame(own.camera, own.world_from_camera, other.camera, other.world_from_camera)
@@ -164,8 +169,9 @@ def _look_up(
         was = np.zeros(depth.shape, bool)
     else:
         was = cv2.remap(given.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+    inside = (u > 0) & (v > 0) & (u < other.camera.width - 1) & (v < other.camera.height - 1)
     # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
-    return there / third, spread / third, was
+    return there / third, spread / third, was, inside
 
 
 def _undistorted(frame: Frame, own: DepthMap) -> NDArray[np.uint8]:

@@ -32,9 +32,7 @@ def by_gps(positions: Array, told: Array, gimbals: list[tuple[float, float, floa
     known = np.isfinite(told[:, :2]).all(1)
     if known.sum() < 2 or np.ptp(told[known, :2], axis=0).max() < 1.0:
         raise InputError("The GPS positions are too few or all at one place, so they cannot scale the map.")
-    centred = told[known, :2] - told[known, :2].mean(0)
-    spread = np.linalg.svd(centred, compute_uv=False)
-    if known.sum() >= 4 and spread[1] > COLLINEAR * spread[0] and np.isfinite(told[known, 2]).all():
+    if known.sum() >= 4 and not on_a_line(told) and np.isfinite(told[known, 2]).all():
         return _robust(positions[known], told[known])
     level = np.eye(4)
     level[:3, :3] = _upright(gimbals, rotations)
@@ -44,6 +42,31 @@ def by_gps(positions: Array, told: Array, gimbals: list[tuple[float, float, floa
     matrix = _robust(flat_from, flat_to) @ level
     heights = told[:, 2] - transform(matrix, positions)[:, 2]
     matrix[2, 3] += float(np.nanmedian(heights)) if np.isfinite(heights).any() else 0.0
+    return matrix
+
+
+def on_a_line(told: Array) -> bool:
+    """Whether GPS positions [n, 3] lie on a line in plan, so that they leave one tilt open."""
+    known = told[np.isfinite(told[:, :2]).all(1), :2]
+    spread = np.linalg.svd(known - known.mean(0), compute_uv=False)
+    return bool(len(known) < 3 or spread[1] <= COLLINEAR * spread[0])
+
+
+def level_line(positions: Array, gimbals: list[tuple[float, float, float] | None], rotations: Array) -> Array:
+    """The rotation [4, 4] about the line of the cameras that brings their up direction as near to +z as it can."""
+    middle = positions.mean(0)
+    axis = np.linalg.svd(positions - middle, full_matrices=False)[2][0]
+    up = _up(gimbals, rotations)
+    across = np.cross(axis, [0.0, 0, 1])
+    across /= max(float(np.linalg.norm(across)), 1e-12)
+    above = np.cross(across, axis)
+    angle = np.arctan2(up @ across, up @ above)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    matrix = np.eye(4)
+    for sign in (1, -1):  # Rodrigues; the sense that takes the sideways part away
+        turn = np.eye(3) + np.sin(sign * angle) * cross + (1 - np.cos(angle)) * cross @ cross
+        if abs(turn @ up @ across) < 1e-6 + 1e-3 * abs(up @ across):
+            matrix[:3, :3], matrix[:3, 3] = turn, middle - turn @ middle
     return matrix
 
 
@@ -74,14 +97,18 @@ def _fit_flat(source: Array, target: Array, weights: Array) -> Array:
 
 
 def _upright(gimbals: list[tuple[float, float, float] | None], rotations: Array) -> Array:
-    """The rotation [3, 3] that turns the reconstruction's up to +z: by gimbals, else against the mean view."""
+    """The rotation [3, 3] that turns the reconstruction's up to +z."""
+    return _to_z(_up(gimbals, rotations))
+
+
+def _up(gimbals: list[tuple[float, float, float] | None], rotations: Array) -> Array:
+    """The reconstruction's up direction [3]: by gimbals, else against the mean view."""
     ups = [
         rotation @ rotation_from_gimbal(*gimbal)[2]  # the world's z in camera axes
         for gimbal, rotation in zip(gimbals, rotations, strict=True)
         if gimbal is not None
     ]
-    up = np.mean(ups, axis=0) if ups else -rotations[:, :, 2].mean(0)
-    return _to_z(up)
+    return np.asarray(np.mean(ups, axis=0) if ups else -rotations[:, :, 2].mean(0))
 
 
 def _to_z(up: Array) -> Array:

@@ -11,7 +11,6 @@ import numpy as np
 
 from overfly import __version__
 from overfly.cloud import Cloud
-from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
 from overfly.mapping.block import Block, checked, given_block, keep_cloud, kept_cloud, read_block, write_block
 from overfly.mapping.deliver import deliver
@@ -20,7 +19,7 @@ from overfly.mapping.settings import MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of
 
 FEWEST_POINTS = 30
-"""Sparse points that tell depth ranges and the ground; with fewer, the altitude is asked for."""
+"""Sparse points that tell the height of the ground."""
 
 
 def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> dict[str, Any]:
@@ -70,7 +69,7 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
     key = key_of(key, asked.dense, network if asked.dense == "sweep" else None, asked.seed)
     make: Callable[[Path], Cloud] = {
         "sweep": lambda _: sweep_cloud(block, flight, asked, steps),
-        "stereo": lambda scratch: stereo_cloud(block, flight, scratch, steps),
+        "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
     }[asked.dense]
     local = steps.kept("dense", key, make, keep_cloud, kept_cloud)
     steps.say("dense", f"{count_text(len(local))} points by {_how(asked)}")
@@ -84,19 +83,15 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
     return checked(align(flight, workdir=scratch, seed=asked.seed, bar=steps.bar), flight)
 
 
-def stereo_cloud(block: Block, flight: Flight, scratch: Path, steps: Steps) -> Cloud:
+def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:
     """The dense cloud by semi-global matching, in the block's frame."""
     from overfly.mapping.fuse import fuse
-    from overfly.mapping.stereo import choose_pairs, depth_maps, depth_ranges, ranges_over_ground
+    from overfly.mapping.stereo import stereo
 
-    if block.points is not None and len(block.points) >= FEWEST_POINTS:
-        ranges = depth_ranges(block.frames, block.points)
-    else:
-        ranges = ranges_over_ground(block.frames, ground_height(block, flight))
-    pairing = choose_pairs(block.frames, ranges)
-    folder = scratch / "depth"
-    depth_maps(block.frames, ranges, pairing, folder=folder, bar=steps.bar)
-    return fuse(block.frames, pairing, folder=folder, bar=steps.bar)
+    with steps.bar("dense", "depth maps") as update:
+        maps = stereo(block.frames, workdir=scratch, points=block.points, seed=asked.seed, progress=update)
+    with steps.bar("dense", "fused") as update:
+        return fuse(maps, block.frames, progress=update)
 
 
 def sweep_cloud(block: Block, flight: Flight, asked: MapSettings, steps: Steps) -> Cloud:
@@ -115,30 +110,26 @@ def sweep_cloud(block: Block, flight: Flight, asked: MapSettings, steps: Steps) 
         return network_cloud(
             block.frames,
             asked.network,
-            ground_height=ground_height(block, flight),
+            ground_height=ground_height(block, flight, asked.seed),
             priors=priors,
             progress=update,
         )
 
 
-def ground_height(block: Block, flight: Flight) -> float:
-    """Prior height of the ground in the block's frame: sparse points, else the altitude that the flight tells.
-
-    Raises:
-        InputError: neither is known.
-    """
+def ground_height(block: Block, flight: Flight, seed: int) -> float:
+    """Prior height of the ground in the block's frame: sparse points, the altitude that the flight tells, or a look."""
     heights = block.poses[:, 2, 3]
     if block.points is not None and len(block.points) >= FEWEST_POINTS:
         return float(np.median(block.points[:, 2]))
-    relative = [(z, f.relative_altitude) for z, f in zip(heights, block.frames, strict=True) if f.relative_altitude]
     if isinstance(altitude := flight.facts.get("altitude"), int | float) and altitude > 0:
         return float(np.median(heights)) - float(altitude)
-    if relative:
+    if relative := [
+        (z, f.relative_altitude) for z, f in zip(heights, block.frames, strict=True) if f.relative_altitude
+    ]:
         return float(np.median([z - above for z, above in relative]))
-    raise InputError(
-        "How high the cameras flew above the ground is not known: give overfly.altitude (metres) in transforms.json, "
-        "or map with --cameras estimate."
-    )
+    from overfly.mapping.coarse import coarse_points
+
+    return float(np.median(coarse_points(block.frames, seed=seed)[:, 2]))
 
 
 def _about(flight: Flight) -> str:

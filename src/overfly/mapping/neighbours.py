@@ -19,7 +19,12 @@ REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
 
 
 def choose_partners(
-    cameras: Sequence[Camera], poses: Sequence[Array], depths: Sequence[float], *, count: int, ratio: tuple[float, float]
+    cameras: Sequence[Camera],
+    poses: Sequence[Array],
+    depths: Sequence[float],
+    *,
+    count: int,
+    ratio: tuple[float, float],
 ) -> list[list[int]]:
     """The partners of every frame, best first.
 

@@ -132,9 +132,7 @@ def stereo(
     return maps
 
 
-def depth_ranges(
-    cameras: Sequence[Camera], poses: Sequence[Array], points: Array
-) -> list[tuple[float, float, float]]:
+def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[tuple[float, float, float]]:
     """Nearest, median and farthest depth of each frame's surface, with margins, from surface points [M, 3]."""
     found: list[tuple[float, float, float] | None] = []
     for camera, pose in zip(cameras, poses):
@@ -150,7 +148,9 @@ def depth_ranges(
         found.append((max(low - 1.5 * margin, 0.05 * middle), float(middle), float(high + margin)))
     known = [f for f in found if f is not None]
     if not known:
-        raise InputError("The surface points lie outside all frames: the cameras and the points do not belong together.")
+        raise InputError(
+            "The surface points lie outside all frames: the cameras and the points do not belong together."
+        )
     usual = tuple(float(np.median([f[k] for f in known])) for k in range(3))
     return [f or (usual[0], usual[1], usual[2]) for f in found]
 
@@ -216,9 +216,7 @@ def _layout(flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, flo
     return i, j, layout
 
 
-def _match(
-    flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]], workdir: Path
-) -> None:
+def _match(flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]], workdir: Path) -> None:
     """Match a pair and keep the left canvas's disparities; an empty file where nothing can be matched."""
     i, j, layout = _layout(flight, pair, ranges)
     found = np.zeros((0, 0), np.int16)
@@ -264,9 +262,7 @@ def _depth(
         depth, sigma, support = consensus(depths, sigmas)
         full = cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR)
         support = cv2.resize(support, size, interpolation=cv2.INTER_NEAREST)
-        refined = refine(
-            flight.shot(i), [flight.shot(j) for j in chosen[:3]], full, steps=(-1, -0.5, 0, 0.5, 1), best=2
-        )
+        refined = refine(flight.shot(i), [flight.shot(j) for j in chosen], full, steps=(-1, -0.5, 0, 0.5, 1), best=2)
         full, score = refined.depth, refined.score
         sigma = refined.step * np.float32(REFINED_SIGMA)
         support[~np.isfinite(full)] = 0

@@ -15,6 +15,10 @@ from overfly.geometry import Array, Camera, invert
 
 Map = NDArray[np.float32]
 
+NOT_SEEN = -0.999
+FAINT = 0.5
+"""Smallest variance of a window, gray levels squared: below it there is only noise, which must not correlate."""
+
 
 @dataclass(frozen=True)
 class Shot:
@@ -57,38 +61,44 @@ def refine(
         reluctance: correlation lost per pixel of offset, which keeps textureless ground where it was.
     """
     height, width = depth.shape
-    warps = [
-        frame_to_frame(reference.camera, reference.world_from_camera, shot.camera, shot.world_from_camera)
-        for shot in neighbours
-    ]
-    inverse = np.where(np.isfinite(depth), 1 / depth, np.nan).astype(np.float32)
-    middle = float(np.nanmedian(inverse))
-    # pixels per unit of inverse depth
-    rates = [_rate(w, middle, width, height) for w in warps]
-    unit = np.float32(1 / max(rates))
-    mean, spread = _moments(reference.gray, window)
+    with np.errstate(divide="ignore"):
+        inverse = (1 / depth).astype(np.float32)
+    middle = float(np.nanmedian(inverse)) if np.isfinite(inverse).any() else 1.0
+    looks = [look for shot in neighbours if (look := _look(reference, shot, inverse)) is not None]
+    blank = np.full(depth.shape, -1, np.float32)
+    if not looks:
+        return Refined(depth.copy(), blank, np.full(depth.shape, np.nan, np.float32))
+    unit = np.float32(1 / max(_rate(look, middle, width, height) for look in looks))
     scores = []
     for step in steps:
         trial = inverse + np.float32(step) * unit
-        found = []
-        for shot, warp in zip(neighbours, warps):
-            found.append(_correlate(reference.gray, mean, spread, shot, warp, trial, window))
-        stack = np.sort(np.stack(found), axis=0)[::-1][:best]
-        scores.append(stack.mean(0) - np.float32(reluctance * abs(step)))
+        # The best correlations of each pixel, among the neighbours that see it.
+        top = [blank.copy() for _ in range(best)]
+        for look in looks:
+            found = _correlate(look, trial, window)
+            for k in range(best):
+                box = top[k][look.box]
+                top[k][look.box], found = np.maximum(box, found), np.minimum(box, found)
+        total, seen = top[0].copy(), np.ones(depth.shape, np.float32)
+        for more in top[1:]:
+            counts = more > NOT_SEEN
+            total += np.where(counts, more, 0)
+            seen += counts
+        scores.append(total / seen - np.float32(reluctance * abs(step)))
     cube = np.stack(scores)
-    top = cube.argmax(0)
-    inner = np.clip(top, 1, len(steps) - 2)
+    top_step = cube.argmax(0)
+    inner = np.clip(top_step, 1, len(steps) - 2)
     before, here, after = (np.take_along_axis(cube, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
     bend = before - 2 * here + after
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = np.where(bend < 0, np.clip(0.5 * (before - after) / bend, -1, 1), 0)
-    spacing = np.float32(steps[1] - steps[0])
-    offset = np.asarray(steps, np.float32)[inner] + shift * spacing
+    at = np.asarray(steps, np.float32)
     # At the end of the range the parabola has no other side: take the sample itself.
-    offset = np.where(top == inner, offset, np.asarray(steps, np.float32)[top])
+    offset = np.where(top_step == inner, at[inner] + shift * (at[1] - at[0]), at[top_step])
     score = cube.max(0)
-    moved = inverse + np.where(score > 0, offset, 0) * unit
-    return Refined((1 / moved).astype(np.float32), score.astype(np.float32), (depth * depth * unit).astype(np.float32))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = 1 / (inverse + np.where(score > 0, offset, 0) * unit)
+    return Refined(moved.astype(np.float32), score.astype(np.float32), (depth * depth * unit).astype(np.float32))
 
 
 def frame_to_frame(
@@ -105,39 +115,55 @@ def frame_to_frame(
     return q, (other.matrix() @ relative[:3, 3]).astype(np.float32)
 
 
-def _rate(warp: tuple[list[Map], NDArray[np.float32]], middle: float, width: int, height: int) -> float:
-    """Pixels that the middle of the frame moves in the neighbour per unit of inverse depth."""
-    q, t = warp
-    centre = np.array([m[height // 2, width // 2] for m in q], float)
-    a, b = centre + middle * 0.99 * t, centre + middle * 1.01 * t
+@dataclass(frozen=True)
+class _Look:
+    """The part of the frame that a neighbour sees, with all that does not change between hypotheses."""
+
+    box: tuple[slice, slice]
+    gray: Map
+    inside: NDArray[np.bool_]
+    q: list[Map]
+    t: NDArray[np.float32]
+    shot: Shot
+
+
+def _look(reference: Shot, shot: Shot, inverse: Map) -> _Look | None:
+    q, t = frame_to_frame(reference.camera, reference.world_from_camera, shot.camera, shot.world_from_camera)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        third = q[2] + inverse * t[2]
+        u, v = (q[0] + inverse * t[0]) / third, (q[1] + inverse * t[1]) / third
+        inside = (third > 0) & (u > 2) & (v > 2) & (u < shot.camera.width - 2) & (v < shot.camera.height - 2)
+    rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
+    if not len(rows):
+        return None
+    box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
+    return _Look(box, reference.gray[box], inside[box], [np.ascontiguousarray(m[box]) for m in q], t, shot)
+
+
+def _rate(look: _Look, middle: float, width: int, height: int) -> float:
+    """Pixels that the middle of the seen part moves in the neighbour per unit of inverse depth."""
+    q = np.array([m[m.shape[0] // 2, m.shape[1] // 2] for m in look.q], float)
+    a, b = q + middle * 0.99 * look.t, q + middle * 1.01 * look.t
     return float(np.linalg.norm(b[:2] / b[2] - a[:2] / a[2]) / (0.02 * middle)) + 1e-9
 
 
-def _moments(image: Map, window: int) -> tuple[Map, Map]:
+def _correlate(look: _Look, trial: Map, window: int) -> Map:
+    """Zero-mean normalised correlation of the seen part and the neighbour warped by the inverse depth ``trial``."""
     import cv2
 
+    inverse, q, t = trial[look.box], look.q, look.t
+    third = 1 / (q[2] + inverse * t[2])
+    u = (q[0] + inverse * t[0]) * third - np.float32(0.5)
+    v = (q[1] + inverse * t[1]) * third - np.float32(0.5)
+    other = cv2.remap(look.shot.gray, u, v, cv2.INTER_LINEAR)
+    # Where the neighbour sees nothing, the frame itself stands in, so that windows beside it are not spoilt.
+    np.copyto(other, look.gray, where=~look.inside)
     size = (window, window)
-    mean = cv2.boxFilter(image, -1, size)
-    spread = np.sqrt(np.maximum(cv2.boxFilter(image * image, -1, size) - mean * mean, 0.25))
-    return mean, spread
-
-
-def _correlate(
-    gray: Map, mean: Map, spread: Map, shot: Shot, warp: tuple[list[Map], NDArray[np.float32]], trial: Map, window: int
-) -> Map:
-    """Zero-mean normalised correlation [H, W] of the frame and the neighbour warped by the inverse depth ``trial``."""
-    import cv2
-
-    q, t = warp
-    third = q[2] + trial * np.float32(t[2])
-    u = (q[0] + trial * np.float32(t[0])) / third - np.float32(0.5)
-    v = (q[1] + trial * np.float32(t[1])) / third - np.float32(0.5)
-    outside = ~((u > 0) & (v > 0) & (u < shot.camera.width - 1) & (v < shot.camera.height - 1) & (third > 0))
-    u[outside], v[outside] = 0, 0
-    other = cv2.remap(shot.gray, u, v, cv2.INTER_LINEAR)
-    other[outside] = gray[outside]  # does not count: masked below
-    other_mean, other_spread = _moments(other, window)
-    cross = cv2.boxFilter(gray * other, -1, (window, window)) - mean * other_mean
-    score = cross / (spread * other_spread)
-    score[outside] = -1
-    return score
+    mean, other_mean = cv2.boxFilter(look.gray, -1, size), cv2.boxFilter(other, -1, size)
+    # Variances: a quarter of a gray level squared at least, so that noise on blank ground scores low.
+    spread = cv2.sqrBoxFilter(look.gray, cv2.CV_32F, size) - mean * mean
+    other_spread = cv2.sqrBoxFilter(other, cv2.CV_32F, size) - other_mean * other_mean
+    cross = cv2.boxFilter(look.gray * other, -1, size) - mean * other_mean
+    score = cross / np.sqrt(np.maximum(spread, FAINT) * np.maximum(other_spread, FAINT))
+    score[~look.inside] = -1
+    return np.asarray(score, np.float32)

@@ -35,6 +35,8 @@ class Pair:
     centres: Array
     normals: Array
     weights: Array
+    reach: float
+    """Plan distance up to which a pair counts as common ground: a few spacings of the sparser cloud."""
 
     @classmethod
     def thinned(cls, points: Array, target: Array, n: int) -> Pair:
@@ -42,7 +44,8 @@ class Pair:
         points, target = thin(points, n), thin(target, n)
         tree = cKDTree(target)
         ask, ask_target = (np.arange(0, len(p), max(1, len(p) * 4 // n)) for p in (points, target))
-        return cls(points, target, cKDTree(points), tree, ask, ask_target, *_planes(target, tree))
+        reach = 4 * max(_spacing(points), _spacing(target))
+        return cls(points, target, cKDTree(points), tree, ask, ask_target, *_planes(target, tree), reach)
 
     def refine(self, start: Array, mode: str, iterations: int) -> Array:
         """Trimmed point-to-plane ICP over the pairs of both directions, from ``start`` [4, 4]."""
@@ -57,9 +60,13 @@ class Pair:
         return matrix
 
     def misfit(self, matrix: Array) -> float:
-        """Mean distance of the pairs that count."""
+        """Mean distance of the pairs that count, divided by the share of points that have common ground.
+
+        Only common ground is compared, so without the share a fit that hardly overlaps could look best.
+        """
         moved, index = self._pairs(matrix)
-        return float(np.linalg.norm(moved - self.target[index], axis=1).mean())
+        asked = len(self.asked_points) + len(self.asked_target)
+        return float(np.linalg.norm(moved - self.target[index], axis=1).mean() * asked * KEPT / max(len(moved), 1))
 
     def _pairs(self, matrix: Array) -> tuple[Array, NDArray[np.int64]]:
         """Transformed points of the cloud [P, 3] and the indices of their partners in the target [P]."""
@@ -68,11 +75,25 @@ class Pair:
         asked = self.target[self.asked_target]
         moved_back = transform(matrix, self.points[_query(self.points_tree, transform(invert(matrix), asked))[1]])
         backward = np.linalg.norm(moved_back - asked, axis=1)
-        keep, keep_back = (distance <= np.quantile(distance, KEPT) for distance in (forward, backward))
+        # A cloud that reaches beyond the other one (or leaves a part of it out) is not pulled to its middle.
+        common = _near_in_plan(moved, self.target[partner], self.reach)
+        common_back = _near_in_plan(asked, moved_back, self.reach)
+        keep, keep_back = _closest(forward, common), _closest(backward, common_back)
         return (
             np.concatenate([moved[keep], moved_back[keep_back]]),
             np.concatenate([partner[keep], self.asked_target[keep_back]]),
         )
+
+
+def _near_in_plan(points: Array, partners: Array, reach: float) -> NDArray[np.bool_]:
+    """Whether the partner of each point lies within ``reach`` in x and y; all, where hardly any does."""
+    near = np.hypot(*(points[:, :2] - partners[:, :2]).T) <= reach
+    return near if near.mean() > 0.05 else np.ones(len(points), bool)
+
+
+def _closest(distance: Array, common: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The ``KEPT`` share of the common pairs with the smallest distances."""
+    return common & (distance <= np.quantile(distance[common], KEPT))
 
 
 def thin(points: Array, n: int) -> Array:
@@ -85,6 +106,15 @@ def thin(points: Array, n: int) -> Array:
     while len(kept := voxel_thin(points, size)) > n:
         size *= 1.2
     return points[kept]
+
+
+def _spacing(points: Array) -> float:
+    """Typical distance of neighbours in plan."""
+    if len(points) < 2:
+        return 1.0
+    some = points[:: max(1, len(points) // 2000), :2]
+    distance = _query(cKDTree(points[:, :2]), some, 2)[0][:, 1]
+    return float(np.quantile(distance, 0.9)) or 1.0
 
 
 def _planes(points: Array, tree: cKDTree, neighbours: int = 12) -> tuple[Array, Array, Array]:

@@ -1,0 +1,121 @@
+"""The SIFT database of a flight: cameras, key points and verified matches, filled step by step and kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Hashable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.errors import InputError
+from overfly.flights import Flight, Frame, find_preset
+
+DIAGONAL_MM = 43.267
+"""Diagonal of 36 x 24 mm film."""
+
+CHUNK = 40
+"""Pairs matched between two commits: what a kill may lose."""
+
+MODEL = "RADIAL"
+"""One focal length and two radial terms: the second halves the bending of nadir blocks and costs nothing."""
+
+
+def focal_px(frame: Frame) -> float | None:
+    """Focal length in pixels by the camera's data sheet, the EXIF focal-plane tags or the 35 mm equivalent."""
+    if frame.model and frame.focal_mm:
+        try:
+            preset = find_preset(frame.model)
+            return float(frame.focal_mm / preset.sensor_mm[0] * max(frame.width, frame.height))
+        except InputError:
+            pass  # a camera without a data sheet here
+    if frame.focal_px:
+        return float(frame.focal_px)
+    if frame.focal35_mm:
+        return float(frame.focal35_mm / DIAGONAL_MM * np.hypot(frame.width, frame.height))
+    return None
+
+
+def open_database(path: Path, flight: Flight, found: Sequence[tuple[NDArray, NDArray]]) -> tuple[list[int], list[str]]:
+    """Image ids of the frames, and the names of those whose focal length had to be guessed.
+
+    The database is made anew unless it holds exactly these frames with these key points.
+    """
+    import pycolmap
+
+    frames = flight.frames
+    mark = path.with_suffix(".json")
+    content = [[f.name, f.width, f.height, repr(f.camera_key), len(p)] for f, (p, _) in zip(frames, found, strict=True)]
+    guessed = [f.name for f in frames if focal_px(f) is None]
+    if path.is_file() and mark.is_file() and json.loads(mark.read_text()) == content:
+        with pycolmap.Database.open(path) as db:
+            return [db.read_image_with_name(frame.name).image_id for frame in frames], guessed
+    for stale in (path, mark):
+        stale.unlink(missing_ok=True)
+    cameras: dict[Hashable, tuple[int, int]] = {}
+    ids: list[int] = []
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        for frame, (pixels, descriptors) in zip(frames, found, strict=True):
+            if frame.camera_key not in cameras:
+                cameras[frame.camera_key] = _write_camera(db, frame)
+            camera_id, rig_id = cameras[frame.camera_key]
+            image = pycolmap.Image(name=frame.name, camera_id=camera_id)
+            image.image_id = db.write_image(image)
+            unit = pycolmap.Frame()
+            unit.rig_id = rig_id
+            unit.add_data_id(image.data_id)
+            db.write_frame(unit)
+            db.write_keypoints(image.image_id, np.asarray(pixels, np.float32).reshape(-1, 2))
+            kind = pycolmap.FeatureExtractorType.SIFT
+            db.write_descriptors(image.image_id, pycolmap.FeatureDescriptors(kind, descriptors))
+            ids.append(image.image_id)
+    mark.write_text(json.dumps(content))
+    return ids, guessed
+
+
+def _write_camera(db, frame: Frame) -> tuple[int, int]:  # type: ignore[no-untyped-def]
+    """Ids of a new camera and of its rig of one."""
+    import pycolmap
+
+    prior = focal_px(frame)
+    focal = prior or 1.2 * max(frame.width, frame.height)
+    camera = pycolmap.Camera.create_from_model_name(1, MODEL, focal, frame.width, frame.height)
+    camera.has_prior_focal_length = prior is not None
+    camera.camera_id = db.write_camera(camera)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(camera.sensor_id)
+    return camera.camera_id, db.write_rig(rig)
+
+
+def match_pairs(
+    path: Path,
+    names: Sequence[str],
+    pairs: Sequence[tuple[int, int]],
+    *,
+    seed: int,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Match and verify pairs of frames; those that the database holds already are not done again."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    asked = path.with_suffix(".txt")
+    for start in range(0, len(pairs), CHUNK):
+        asked.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in pairs[start : start + CHUNK]))
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = str(asked)
+        pycolmap.match_image_pairs(path, matching, pairing, verification, device=pycolmap.Device.cpu)
+        progress(min(start + CHUNK, len(pairs)), len(pairs))
+
+
+def strongest_pair(path: Path) -> int:
+    """The largest number of verified matches of a pair."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as db:
+        _, geometries = db.read_two_view_geometries()
+    return max((len(geometry.inlier_matches) for geometry in geometries), default=0)
