@@ -118,9 +118,16 @@ def test_trainer_flags_that_people_use_need_no_plus() -> None:
 
 @pytest.mark.parametrize(
     ("override", "allowed"),
-    [("overlap=120", "0 to 95"), ("altitude=-5", "20 to 500"), ("overlap=abc", "0 to 95"),
-     ("overlap=[30,99]", "0 to 95"), ("side_overlap=-1", "0 to 95"), ("frames=0", "1 to 8"), ("altitude=true", "20 to 500")],
-)  # fmt: skip
+    [
+        ("overlap=120", "0 to 95"),
+        ("altitude=-5", "20 to 500"),
+        ("overlap=abc", "0 to 95"),
+        ("overlap=[30,99]", "0 to 95"),
+        ("side_overlap=-1", "0 to 95"),
+        ("frames=0", "1 to 8"),
+        ("altitude=true", "20 to 500"),
+    ],
+)
 def test_values_that_no_flight_can_have_are_refused(override: str, allowed: str) -> None:
     with pytest.raises(InputError, match=allowed):
         check(composed(override))

@@ -128,14 +128,15 @@ def _points(
         w = np.where(same, 1 / spread**2, 0)
         total += w
         mean += np.where(same, w * found, 0)
-    several = (data["support"] >= 2) | (agree >= 1)
-    known = np.isfinite(depth) & (several | single)
+    # One pair alone must at least agree with itself, seen from its other frame.
+    votes = np.maximum(agree, data["support"])
+    known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = unproject(pixels, merged, own.camera, own.world_from_camera)
-    votes = np.maximum(agree, data["support"])[fresh]
+    votes = votes[fresh]
     image = _undistorted(frames[own.name], own)
     cloud = Cloud(
         points,
