@@ -8,14 +8,22 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
 
 from overfly.errors import InputError
-from overfly.run import load_run
+from overfly.run import load_run, main
 from overfly.tables import read_rows
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
+    pytest.mark.filterwarnings("ignore:.*module.s. in eval mode at the start of training"),
+]
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -25,18 +33,28 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.fixture
-def train(tmp_path: Path, cache: Path):  # type: ignore[no-untyped-def]
-    """Run train.py in an empty folder."""
+@dataclass
+class Result:
+    stdout: str
+    stderr: str
 
-    def run(*overrides: str, code: int = 0) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, str(ROOT / "train.py"), f"cache_dir={cache}", "trainer.accelerator=cpu", *overrides]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "WANDB_MODE": "offline"}
-        result = subprocess.run(
-            command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=300, check=False
-        )
-        assert result.returncode == code, result.stderr[-3000:]
-        return result
+
+@pytest.fixture
+def train(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    """Run train.py's entry in an empty folder (in this process: a new one takes seconds to import everything)."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+
+    def run(*overrides: str, code: int = 0) -> Result:
+        capfd.readouterr()
+        try:
+            ended = main([*overrides, f"cache_dir={cache}", "trainer.accelerator=cpu"])
+        except SystemExit as stop:
+            ended = int(stop.code or 0)
+        out, err = capfd.readouterr()
+        assert ended == code, err[-3000:]
+        return Result(out, err)
 
     return run
 

@@ -207,6 +207,7 @@ def _quieten() -> None:
     for message in (
         r".*isinstance\(treespec, LeafSpec\).*",  # Lightning's own use of torch
         r".*does not have many workers.*",  # small data: loading is not what training waits for
+        r"Checkpoint directory .* exists and is not empty.*",  # a resumed run goes on in its own folder
         r".*module\(s\) in eval mode at the start of training.*",  # the frozen encoder
     ):
         warnings.filterwarnings("ignore", message)
@@ -360,7 +361,8 @@ def _resumed(argv: Sequence[str]) -> list[str]:
             "such as resume=outputs/all/2026-01-31_12-00-00-000000."
         )
     kept = [line for line in recorded.read_text().splitlines() if line and not line.startswith("resume=")]
-    return [*kept, *argv, f"hydra.run.dir={folder}"]
+    first = next((i for i, item in enumerate(argv) if "=" in item and not item.startswith("-")), len(argv))
+    return [*argv[:first], *kept, *argv[first:], f"hydra.run.dir={folder}"]  # flags come before every override
 
 
 def explain(error: BaseException) -> str | None:

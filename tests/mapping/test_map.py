@@ -327,3 +327,31 @@ def test_a_frame_whose_z_is_not_up_gets_no_rasters_and_keeps_its_cloud(tmp_path:
     assert summary["gsd_m"] == pytest.approx(55 / 80, rel=0.02)
     deliver(lying, upright_block, Cloud(ground), out, MapSettings(dense="stereo"), steps)
     assert (out / "dsm.tif").exists()
+
+
+def test_stereo_measures_the_ground_without_a_network(tmp_path: Path) -> None:
+    import cv2
+
+    flight = make_flight(tmp_path / "f", 4)
+    data = json.loads((flight / "transforms.json").read_text())
+    camera = CAMERA.resized(288, 216)
+    texture = np.random.default_rng(0).integers(0, 255, (512, 512), dtype=np.uint8)
+    texture = cv2.GaussianBlur(cv2.resize(texture, (1024, 1024), interpolation=cv2.INTER_CUBIC), (0, 0), 1)
+    for i, frame in enumerate(data["frames"]):
+        matrix = np.array(frame["transform_matrix"]) @ OPENCV_FROM_OPENGL
+        xy = on_plane(pixel_grid(288, 216), camera, matrix, GROUND)[..., :2]
+        at = (xy * 5 + 512).astype(np.float32)  # 20 cm of texture, 23 cm of GSD
+        grey = cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        Image.fromarray(np.repeat(grey[..., None], 3, -1)).save(flight / "images" / f"{i}.png")
+    data |= {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": 288, "h": 216}
+    (flight / "transforms.json").write_text(json.dumps(data))
+    summary = mapped(flight, tmp_path / "out", dense="stereo", network=None)
+    cloud = read_cloud(tmp_path / "out" / "cloud.laz")
+    assert summary["predicted"] == 0
+    assert len(cloud) > 20_000
+    away = np.abs(cloud.points[:, 2] - GROUND)
+    assert np.median(away) < 0.1
+    assert np.quantile(away, 0.95) < 0.5
+    assert cloud.views is not None
+    assert cloud.views.min() >= 2
+    assert mapped(flight, tmp_path / "out", dense="stereo", network=None)["reused"] == ["cameras", "dense"]

@@ -82,7 +82,7 @@ def test_gallery_has_every_picture_and_counts_views() -> None:
         missing=[("c.jpg", np.array([50.0, 10, 50]))],
     )
     assert [p.title for p in shown] == [
-        "From above", "Heights", "The cloud from the south", "Images", "Overlap", "Measured and predicted ground",
+        "From above", "Heights", "The cloud", "Images", "Overlap", "Measured and predicted ground",
     ]  # fmt: skip
     from PIL import Image
 

@@ -24,7 +24,7 @@ Bar = Callable[[str, str], AbstractContextManager[Callable[..., Any]]]
 GPS_SIGMA_M = (0.5, 0.5)
 """Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""
 
-BAROMETER_SIGMA_M = 0.2
+BAROMETER_SIGMA_M = 0.15
 """The same of a height that the drone's barometer holds (frames with a relative altitude)."""
 
 FAR_OFF_M = 8.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ def open_database(path: Path, flight: Flight, found: Sequence[tuple[NDArray, NDA
     return ids, guessed
 
 
-def _write_camera(db, frame: Frame) -> tuple[int, int]:  # type: ignore[no-untyped-def]
+def _write_camera(db: Any, frame: Frame) -> tuple[int, int]:
     """Ids of a new camera and of its rig of one."""
     import pycolmap
 

@@ -13,13 +13,14 @@ from overfly.geometry import Array
 
 FEATURES = 5000
 LONGEST_SIDE = 1600
-NEIGHBOURS = 3
+NEIGHBOURS = 2
 """Nearest frames in each of eight directions that a frame is matched with."""
 
 COARSE_FEATURES = 600
 COARSE_RATIO = 0.8
 FEWEST_COARSE = 5
 MOST_PARTNERS = 14
+CHUNK = 16
 SMALL_FLIGHT = 8
 """Up to this many frames all pairs are matched."""
 
@@ -41,7 +42,7 @@ def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[n
     if factor < 1:
         gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     # A low contrast threshold: meadows and asphalt have key points too, and the strongest are chosen anyway.
-    sift = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
     found, raw = sift.detectAndCompute(gray, None)
     if len(found):
         order = np.argsort([-point.size for point in found], kind="stable")[:FEATURES]
@@ -98,19 +99,19 @@ def _alike(
     asking: list[int], descriptors: Sequence[NDArray[np.uint8]], progress: Callable[[int, int], None] | None
 ) -> set[tuple[int, int]]:
     """Pairs that share coarse key points: the best partners of each asking frame among all frames."""
-    units = []
-    for raw in descriptors:
+    n = len(descriptors)
+    units = np.zeros((n, COARSE_FEATURES, 128), np.float32)
+    for unit, raw in zip(units, descriptors, strict=True):
         few = raw[:COARSE_FEATURES].astype(np.float32)
-        units.append(few / np.maximum(np.linalg.norm(few, axis=1, keepdims=True), 1e-9))
-    n = len(units)
+        unit[: len(few)] = few / np.maximum(np.linalg.norm(few, axis=1, keepdims=True), 1e-9)
     counts = np.zeros((n, n), int)
-    asked = set(asking)
     for done, i in enumerate(asking):
-        for j in range(n):
-            if j != i and not (j in asked and j < i):
-                counts[i, j] = counts[j, i] = _count_matches(units[i], units[j])
+        for start in range(0, n, CHUNK):  # one product for many frames: small ones cost more to start than to run
+            counts[i, start : start + CHUNK] = _count_matches(units[i], units[start : start + CHUNK])
+        counts[i, i] = 0
         if progress:
             progress(done + 1, len(asking))
+    counts = np.maximum(counts, counts.T)
     pairs = set()
     for i in asking:
         for j in np.argsort(-counts[i], kind="stable")[:MOST_PARTNERS].tolist():
@@ -119,15 +120,13 @@ def _alike(
     return pairs
 
 
-def _count_matches(a: NDArray[np.float32], b: NDArray[np.float32]) -> int:
-    """Mutual nearest neighbours that pass the ratio test."""
-    if min(len(a), len(b)) < 2:
-        return 0
-    similarity = a @ b.T
-    rows = np.arange(len(a))
-    best = similarity.argmax(1)
-    mutual = similarity.argmax(0)[best] == rows
-    first = similarity[rows, best]
-    similarity[rows, best] = -1
-    # Unit vectors: squared distance = 2 - 2 cos.
-    return int((mutual & (1 - first < COARSE_RATIO**2 * (1 - similarity.max(1)))).sum())
+def _count_matches(own: NDArray[np.float32], others: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Matches [m] of unit descriptors [n, 128] with each of [m, n, 128] that pass the ratio test, each taken once."""
+    m, n, _ = others.shape
+    similarity = (others.reshape(m * n, -1) @ own.T).reshape(m, n, len(own))
+    best = similarity.argmax(2)
+    first = np.take_along_axis(similarity, best[..., None], axis=2)
+    np.put_along_axis(similarity, best[..., None], -1, axis=2)
+    # Unit vectors: squared distance = 2 - 2 cos. Blank rows have similarity 0 to all and fail.
+    good = 1 - first[..., 0] < COARSE_RATIO**2 * (1 - similarity.max(2))
+    return np.array([len(np.unique(b[g])) for b, g in zip(best, good, strict=True)])

@@ -1,4 +1,4 @@
-"""Depth maps of many frames become one cloud: checked against each other, averaged where they agree, each place once."""
+"""Depth maps of many frames become one cloud: checked against each other, averaged where they agree, no place twice."""
 
 from __future__ import annotations
 
@@ -163,9 +163,11 @@ def _look_up(
         third = q[2] + inverse * t[2]
         u = np.nan_to_num((q[0] + inverse * t[0]) / third - np.float32(0.5), nan=-9, posinf=-9, neginf=-9)
         v = np.nan_to_num((q[1] + inverse * t[1]) / third - np.float32(0.5), nan=-9, posinf=-9, neginf=-9)
-    nothing = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": float("nan")}
-    there = cv2.remap(data["depth"], u, v, cv2.INTER_NEAREST, **nothing)
-    spread = cv2.remap(data["sigma"], u, v, cv2.INTER_NEAREST, **nothing)
+    nan = float("nan")
+    there, spread = (
+        cv2.remap(data[name], u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
+        for name in ("depth", "sigma")
+    )
     if given is None:
         was = np.zeros(depth.shape, bool)
     else:

@@ -15,7 +15,7 @@ from overfly.mapping import pictures
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Picture
 
-SHOWN = 2_000_000
+SHOWN = 1_000_000
 """Points kept for the oblique picture: more would not be seen in it."""
 
 
@@ -68,22 +68,23 @@ def gallery(
     shown_points = cloud
     if len(cloud) > SHOWN:
         shown_points = cloud[np.random.default_rng(0).choice(len(cloud), SHOWN, replace=False)]
+    up = "north is up" if unit == "m" else "the frame's y axis is up, where north is nobody knows"
     shown = [
         Picture(
             "The map",
             "From above",
-            "Colours of the cloud seen straight from above; north is up. White: nothing measured.",
+            f"Colours of the cloud seen straight from above; {up}. White: nothing measured.",
             pictures.jpeg(enlarged(pictures.top_view(seen))),
         ),
         Picture(
             "The map",
             "Heights",
-            "Surface heights over a hillshade (light from the north-west).",
+            "Surface heights over a hillshade (light from the upper left).",
             pictures.png(pictures.height_map(seen, offset=height_offset, unit=unit)),
         ),
         Picture(
             "In perspective",
-            "The cloud from the south",
+            "The cloud",
             "Every point with its own colour, as stored in cloud.laz.",
             pictures.jpeg(pictures.oblique_view(shown_points)),
         ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,9 @@ NOISE_PX = 0.25
 
 WORST_PX = 3.0
 
+THREADS = 1
+"""Sums in the order of one thread: the same seed gives the same cameras to the last bit."""
+
 
 def mapped(database: Path, images: Path, workdir: Path, *, total: int, seed: int) -> Any:
     """The model with most of the ``total`` frames, or None.
@@ -37,6 +41,8 @@ def mapped(database: Path, images: Path, workdir: Path, *, total: int, seed: int
             continue
         options = pycolmap.GlobalPipelineOptions()
         options.random_seed = seed
+        options.num_threads = THREADS
+        options.mapper.bundle_adjustment.ceres.solver_options.num_threads = THREADS
         options.min_model_size = 2
         options.mapper.track_min_num_views_per_track = views
         options.mapper.global_positioning.min_num_view_per_track = views
@@ -46,11 +52,12 @@ def mapped(database: Path, images: Path, workdir: Path, *, total: int, seed: int
             options.mapper.bundle_adjustment.refine_focal_length = False
             options.mapper.bundle_adjustment.refine_extra_params = False
         folder = _folder(workdir / f"global{views}")
-        best = _better(best, _attempt(lambda f=folder, o=options: pycolmap.global_mapping(database, images, f, o)))
+        best = _better(best, _attempt(partial(pycolmap.global_mapping, database, images, folder, options)))
         if best is not None and best.num_reg_images() == total:
             return best
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.random_seed = seed
+    pipeline.num_threads = THREADS
     pipeline.min_model_size = 2
     pipeline.min_num_matches = FEWEST_MATCHES
     pipeline.extract_colors = False
@@ -61,7 +68,7 @@ def mapped(database: Path, images: Path, workdir: Path, *, total: int, seed: int
         pipeline.mapper.init_min_num_inliers = 30
         pipeline.mapper.init_min_tri_angle = 4
     folder = _folder(workdir / "incremental")
-    return _better(best, _attempt(lambda: pycolmap.incremental_mapping(database, images, folder, pipeline)))
+    return _better(best, _attempt(partial(pycolmap.incremental_mapping, database, images, folder, pipeline)))
 
 
 def _attempt(run: Callable[[], dict[int, Any]]) -> dict[int, Any]:
@@ -101,6 +108,7 @@ def adjust(model: Any, ids: Sequence[int], places: Array | None, sigmas: Array |
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = 2 * NOISE_PX
+    options.ceres.solver_options.num_threads = THREADS
     options.ceres.solver_options.max_num_iterations = 150
     options.ceres.solver_options.function_tolerance = 1e-7
     config = pycolmap.BundleAdjustmentConfig()

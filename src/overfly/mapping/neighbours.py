@@ -15,7 +15,7 @@ CANDIDATES = 40
 """Nearest cameras that are looked at."""
 
 REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
-"""What seeing a place once more is worth: the first partner of a place makes it measured, the later ones make it sure."""
+"""What seeing a place once more is worth: the first partner makes it measured, the later ones make it sure."""
 
 
 def choose_partners(

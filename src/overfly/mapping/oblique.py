@@ -51,6 +51,7 @@ def splat(
 ) -> NDArray[np.uint8]:
     """Draw points as squares of (2 radius + 1)^2 pixels, nearest first, on white; edges of depth are shaded."""
     order = np.argsort(-depth, kind="stable")  # far to near: the last write wins
+    depth, colors = depth[order], colors[order]
     column, row = np.floor(u[order]).astype(np.int64), np.floor(v[order]).astype(np.int64)
     nearest = np.full(width * height, np.inf)
     image = np.full((width * height, 3), PAPER, np.uint8)
@@ -59,10 +60,10 @@ def splat(
             c, r = column + dx, row + dy
             inside = np.flatnonzero((c >= 0) & (c < width) & (r >= 0) & (r < height))
             cell = r[inside] * width + c[inside]
-            d = depth[order][inside]
+            d = depth[inside]
             np.minimum.at(nearest, cell, d)
             front = d <= nearest[cell]
-            image[cell[front]] = colors[order][inside][front]
+            image[cell[front]] = colors[inside[front]]
     return _edge_shaded(image.reshape(height, width, 3), nearest.reshape(height, width))
 
 

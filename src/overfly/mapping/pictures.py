@@ -166,9 +166,10 @@ def block_map(
     figure, axes = _map_figure(frame, width_in)
     faded = 255 - (255 - top_view(seen).astype(float)) * 0.45
     axes.imshow(faded.astype(np.uint8), extent=seen.grid.extent, interpolation="nearest")
+    many = np.clip(12 / max(len(corners), 1), 0.15, 1)  # hundreds of footprints must not hide the map
     for corner in corners:
-        axes.fill(corner[:, 0], corner[:, 1], facecolor=GOOD, edgecolor=GOOD, alpha=0.05)
-        axes.fill(corner[:, 0], corner[:, 1], fill=False, edgecolor=GOOD, linewidth=0.5, alpha=0.6)
+        axes.fill(corner[:, 0], corner[:, 1], facecolor=GOOD, edgecolor=GOOD, alpha=0.06 * many)
+        axes.fill(corner[:, 0], corner[:, 1], fill=False, edgecolor=GOOD, linewidth=0.5, alpha=0.7 * many)
     axes.plot(points[:, 0], points[:, 1], "-", color=INK, linewidth=0.7, alpha=0.6)
     axes.plot(points[:, 0], points[:, 1], "o", color=GOOD, markersize=4, label=f"registered ({len(points)})")
     if len(lost):
@@ -226,7 +227,8 @@ def _mappable(norm: Any, colours: Any) -> Any:
 
 
 def _furnish(axes: Axes, grid: Grid, unit: str) -> None:
-    """Scale bar and north arrow in place of axes."""
+    """Scale bar and north arrow in place of axes; a frame without metres knows no north either, so its y is shown."""
+    up = "N" if unit == "m" else "y"
     axes.set_axis_off()
     x_min, x_max, y_min, y_max = grid.extent
     width, height = x_max - x_min, y_max - y_min
@@ -240,7 +242,7 @@ def _furnish(axes: Axes, grid: Grid, unit: str) -> None:
         fontsize=8, color=INK, bbox=halo,
     )  # fmt: skip
     axes.annotate(
-        "N", xy=(0.965, 0.985), xytext=(0.965, 0.875), xycoords="axes fraction", ha="center", fontsize=9, color=INK,
+        up, xy=(0.965, 0.985), xytext=(0.965, 0.875), xycoords="axes fraction", ha="center", fontsize=9, color=INK,
         bbox=halo, arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.6},
     )  # fmt: skip
     axes.set_xlim(x_min, x_max)

@@ -122,7 +122,7 @@ def verdict(summary: Mapping[str, Any]) -> str:
         text += f" at {length_text(summary['gsd_m'])} per pixel."
     else:
         text += f" and mapped with {count_text(summary['points'])} points, in units of unknown length:"
-        text += " the images carry no GPS, so shape is right and size is not known."
+        text += " neither GPS nor an origin tells the size, only the shape is known."
     share = summary["predicted"] / max(summary["points"], 1)
     if share >= 0.005:
         text += f" {share:.0%} of the points are predicted from less than two images, not measured."

@@ -23,7 +23,7 @@ from overfly.mapping.coarse import coarse_points
 from overfly.mapping.consensus import consensus
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.neighbours import choose_partners
-from overfly.mapping.rectify import ordered, rectify
+from overfly.mapping.rectify import Rectified, ordered, rectify
 from overfly.mapping.subpixel import Shot, refine
 
 Progress = Callable[[int, int], None]
@@ -205,7 +205,9 @@ def _pair_file(workdir: Path, pair: tuple[int, int]) -> Path:
     return workdir / f"pair-{pair[0]:05d}-{pair[1]:05d}.npy"
 
 
-def _layout(flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]]):  # type: ignore[no-untyped-def]
+def _layout(
+    flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]]
+) -> tuple[int, int, Rectified | None]:
     """Left frame, right frame and their rectification, None where it is not possible."""
     i, j = pair if ordered((flight.poses[pair[0]], flight.poses[pair[1]])) else pair[::-1]
     layout = rectify(
