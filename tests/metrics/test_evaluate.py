@@ -11,6 +11,7 @@ from rich.console import Console
 
 from overfly.cloud import Cloud, read_cloud, write_cloud
 from overfly.errors import InputError
+from overfly.geometry import Origin, crs_from_enu
 from overfly.metrics import functional as f
 from overfly.metrics.evaluate import evaluate, format_table
 
@@ -97,6 +98,22 @@ def test_frames() -> None:
     laid = evaluate(local, utm, align="shift")
     np.testing.assert_allclose(np.array(laid["transform"])[:3, 3], UTM, atol=0.3)
     assert "by shift" in laid["warnings"][0]
+
+
+def test_the_reference_of_a_flight_folder_is_brought_to_the_crs_of_its_map(tmp_path: Path) -> None:
+    origin = Origin(46.0, 8.0, 450.0, 32632)
+    local = np.random.default_rng(0).uniform(0, 30, (500, 3))
+    (tmp_path / "transforms.json").write_text(
+        json.dumps({"overfly": {"origin": {"latitude": 46.0, "longitude": 8.0, "height": 450.0, "epsg": 32632}}})
+    )
+    write_cloud(Cloud(local), tmp_path / "reference.ply")
+    mapped = Cloud(crs_from_enu(local + np.array([0, 0, 0.5]), origin), epsg=32632)
+    (tmp_path / "map").mkdir()
+    write_cloud(mapped, tmp_path / "map" / "cloud.ply")
+    result = evaluate(tmp_path / "map" / "cloud.ply", tmp_path / "reference.ply", voxel_m=0)
+    assert result["accuracy_median_m"] <= 0.5 + 1e-6
+    assert result["epsg"] == 32632
+    assert "local frame" in result["warnings"][0]
 
 
 def test_small_clouds_are_scaled_up_to_1024() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from overfly import __version__
 from overfly.cloud import Cloud
+from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
 from overfly.mapping.block import Block, checked, given_block, keep_cloud, kept_cloud, read_block, write_block
 from overfly.mapping.deliver import deliver
@@ -65,6 +66,7 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
         lambda folder: read_block(folder, flight),
     )
     steps.say("cameras", _about_block(block, flight))
+    check_memory(block, asked)
     network = None if asked.network is None else _network_key(asked)
     key = key_of(key, asked.dense, network if asked.dense == "sweep" else None, asked.seed)
     make: Callable[[Path], Cloud] = {
@@ -74,6 +76,20 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
     local = steps.kept("dense", key, make, keep_cloud, kept_cloud)
     steps.say("dense", f"{count_text(len(local))} points by {_how(asked)}")
     return deliver(flight, block, local, out, asked, steps)
+
+
+def check_memory(block: Block, asked: MapSettings) -> None:
+    """Refuse before the work starts what would not fit: 1 GB and 40 MB for each megapixel (measured on real flights).
+
+    Raises:
+        InputError: more than ``max_memory_gb`` would be needed.
+    """
+    needed = 1.0 + 0.04 * sum(camera.width * camera.height for camera in block.cameras) / 1e6
+    if asked.max_memory_gb is not None and needed > asked.max_memory_gb:
+        raise InputError(
+            f"Mapping these {len(block.frames)} images takes about {needed:.1f} GB, more than --max-memory "
+            f"{asked.max_memory_gb:g}: allow {np.ceil(needed):.0f}, or map a part of the images or smaller ones."
+        )
 
 
 def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Block:

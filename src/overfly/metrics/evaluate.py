@@ -2,6 +2,7 @@
 
 What is done, in this order, and recorded in the result:
 
+0. bring a cloud of a flight folder, which is in a local frame, to the CRS of the other (``warnings`` says so);
 1. align, only if asked, with all points (``aligned``, ``transform``: reference-from-cloud);
 2. thin both clouds to one point per voxel (``voxel_m``), so that dense spots do not count more than others;
 3. clip the cloud to the neighbourhood of the reference in plan (``clip_m``), because where the reference has nothing it
@@ -11,6 +12,7 @@ What is done, in this order, and recorded in the result:
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from overfly.cloud import Cloud, read_cloud, voxel_thin
 from overfly.errors import InputError, unknown
+from overfly.geometry import Origin, crs_from_enu
 from overfly.metrics import alignment
 from overfly.metrics.functional import (
     GSD_MULTIPLES,
@@ -75,7 +78,8 @@ def evaluate(
     _check_options(align, thresholds_m, voxel_m, clip_m)
     given = cloud if isinstance(cloud, Cloud) else read_cloud(cloud)
     wanted = reference if isinstance(reference, Cloud) else read_cloud(reference)
-    warnings = _check_frames(given, wanted, align)
+    given, wanted, placed = _placed(given, cloud, wanted, reference)
+    warnings = placed + _check_frames(given, wanted, align)
     matrix, points = alignment.align(given.points, wanted.points, align)
     target = wanted.points
     if voxel_m:
@@ -151,6 +155,30 @@ def _check_options(mode: str, thresholds_m: Sequence[float], voxel_m: float, cli
         raise InputError(f"The voxel size {voxel_m} is not a length: give metres above 0, or 0 to keep every point.")
     if clip_m is not None and not clip_m > 0:
         raise InputError(f"The clip distance {clip_m} is not a length: give metres above 0.")
+
+
+def _placed(
+    cloud: Cloud, cloud_file: Path | str | Cloud, reference: Cloud, reference_file: Path | str | Cloud
+) -> tuple[Cloud, Cloud, list[str]]:
+    """A cloud of a flight folder (local ENU) in the other's CRS, by the origin that its transforms.json states."""
+    said: list[str] = []
+    if cloud.epsg and not reference.epsg and (origin := _origin_beside(reference_file, cloud.epsg)):
+        reference = reference.with_points(crs_from_enu(reference.points, origin), epsg=cloud.epsg)
+        said = [f"The reference was brought from its flight's local frame to EPSG:{cloud.epsg}."]
+    elif reference.epsg and not cloud.epsg and (origin := _origin_beside(cloud_file, reference.epsg)):
+        cloud = cloud.with_points(crs_from_enu(cloud.points, origin), epsg=reference.epsg)
+        said = [f"The cloud was brought from its flight's local frame to EPSG:{reference.epsg}."]
+    return cloud, reference, said
+
+
+def _origin_beside(file: Path | str | Cloud, epsg: int) -> Origin | None:
+    """The origin in the transforms.json that lies in the same folder, with the CRS to go to; None without one."""
+    if isinstance(file, Cloud) or not (transforms := Path(file).parent / "transforms.json").is_file():
+        return None
+    stated = json.loads(transforms.read_text()).get("overfly", {}).get("origin")
+    if not stated:
+        return None
+    return Origin(stated["latitude"], stated["longitude"], stated.get("height") or 0.0, epsg)
 
 
 def _check_frames(cloud: Cloud, reference: Cloud, mode: str) -> list[str]:
