@@ -90,7 +90,7 @@ def train(cfg: DictConfig) -> float | None:
     log.info("The run folder is %s", run_dir)
     if cfg.stage_name == "compare":
         return _compare(cfg, run_dir)
-    if "phases" not in cfg:
+    if cfg.stage_name != "all":
         return _train_stage(cfg)
     value, before = None, cfg.from_run
     for name, phase in cfg.phases.items():
