@@ -21,7 +21,7 @@ ORDER = [
     ["stages"],
     ["callbacks"],
     ["mapping"],
-    ["summary", "run"],
+    ["summary", "run_folder", "run"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

@@ -11,7 +11,6 @@ import json
 import logging
 import math
 import os
-import shutil
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from overfly.errors import InputError
+from overfly.run_folder import checkpoint, collect, read_weights, resumed, write_json
 
 if TYPE_CHECKING:
     import torch
@@ -105,7 +105,7 @@ def train(cfg: DictConfig) -> float | None:
             _save_config(part, Path(part.run_dir))
             value = _train_stage(part)
         before = part.run_dir
-        _collect(run_dir, list(cfg.phases))
+        collect(run_dir, list(cfg.phases))
     return value
 
 
@@ -141,7 +141,7 @@ def _train_stage(cfg: DictConfig) -> float | None:
             results = trainer.test(stage, datamodule=data, ckpt_path=best, verbose=False, weights_only=True)
             metrics |= _merged(results)
         if trainer.is_global_zero:
-            _write_json(
+            write_json(
                 run_dir / "metrics.json",
                 {
                     "stage": cfg.stage_name,
@@ -237,30 +237,6 @@ def warm_start(stage: Any, name: str, from_run: str | None) -> list[str]:
     return lines
 
 
-def checkpoint(folder: Path) -> Path | None:
-    """The best checkpoint of a run folder, None if there is none.
-
-    Raises:
-        InputError: the folder does not exist.
-    """
-    if folder.is_file():
-        return folder
-    if not folder.is_dir():
-        raise InputError(f"There is no run folder {folder}: give a folder that train.py wrote, such as outputs/all/...")
-    for part in (folder, folder / "full", folder / "gan", folder / "encoder"):
-        if (part / "checkpoints" / "best.ckpt").is_file():
-            return part / "checkpoints" / "best.ckpt"
-    return None
-
-
-def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """The state dict of a checkpoint (plain tensors only, nothing is unpickled)."""
-    import torch
-
-    weights: dict[str, torch.Tensor] = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
-    return weights
-
-
 @dataclass(frozen=True)
 class Run:
     """A finished run: its network with the best weights in evaluation mode, and its resolved configuration."""
@@ -314,57 +290,6 @@ def _save_config(cfg: DictConfig, folder: Path) -> None:
         (folder / "overrides.txt").write_text("".join(f"{item}\n" for item in overrides))
 
 
-def _collect(run_dir: Path, phases: list[str]) -> None:
-    """Bring the phases' results to the top of a run of ``stage=all``: metrics, curves and the last best weights."""
-    from overfly.callbacks.curves import plot_curves
-    from overfly.tables import read_rows, write_rows
-
-    finished = [name for name in phases if (run_dir / name / "metrics.json").is_file()]
-    results = {name: json.loads((run_dir / name / "metrics.json").read_text()) for name in finished}
-    if not results:
-        return
-    _write_json(
-        run_dir / "metrics.json",
-        {
-            "stage": "all",
-            "monitored": results[finished[-1]]["monitored"],
-            "monitor": results[finished[-1]]["monitor"],
-            "phases": results,
-        },
-    )
-    rows = {name: read_rows(run_dir / name / "metrics.csv") for name in finished}
-    lines: list[dict[str, Any]] = [{"stage": name, **row} for name, part in rows.items() for row in part]
-    if lines:
-        write_rows(run_dir / "metrics.csv", lines)
-        plot_curves({name: part for name, part in rows.items() if part}, run_dir / "curves.png")
-    last = run_dir / finished[-1]
-    shutil.copy(last / "config.yaml", run_dir / "config.yaml")
-    for source in [*last.glob("checkpoints/best.ckpt"), *last.glob("clouds/*")]:
-        target = run_dir / source.relative_to(last)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(source, target)
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n")
-
-
-def _resumed(argv: Sequence[str]) -> list[str]:
-    """With ``resume=RUN``, put that run's own overrides first and go on in its folder."""
-    folder = next((Path(item.removeprefix("resume=")) for item in argv if item.startswith("resume=")), None)
-    if folder is None or str(folder) in ("null", ""):
-        return list(argv)
-    recorded = folder / "overrides.txt"
-    if not recorded.is_file():
-        raise InputError(
-            f"resume={folder} is not a run folder (it has no overrides.txt): give one that train.py wrote, "
-            "such as resume=outputs/all/2026-01-31_12-00-00-000000."
-        )
-    kept = [line for line in recorded.read_text().splitlines() if line and not line.startswith("resume=")]
-    first = next((i for i, item in enumerate(argv) if "=" in item and not item.startswith("-")), len(argv))
-    return [*argv[:first], *kept, *argv[first:], f"hydra.run.dir={folder}"]  # flags come before every override
-
-
 def explain(error: BaseException) -> str | None:
     """One sentence for what the user can mend: what was given, and what is allowed. None for a bug."""
     from hydra.errors import ConfigCompositionException, MissingConfigException
@@ -391,7 +316,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to us, and we say them in one sentence
     register_resolvers()
     try:
-        sys.argv = ["train.py", *_resumed(sys.argv[1:] if argv is None else argv)]
+        sys.argv = ["train.py", *resumed(sys.argv[1:] if argv is None else argv)]
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")(train)()
     except KeyboardInterrupt:
         print(

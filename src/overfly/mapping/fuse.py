@@ -17,8 +17,8 @@ from overfly.mapping.subpixel import Map, frame_to_frame
 
 Progress = Callable[[int, int], None]
 
-GATE = 1.5
-"""Two depths of one place agree within this many standard deviations of their difference: about one pixel."""
+GATE = 3.0
+"""Two depths of one place agree within this many standard deviations of their difference."""
 
 WORST_SCORE = {True: 0.2, False: 0.45}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
@@ -41,7 +41,7 @@ def fuse(
         depth_maps: from :func:`overfly.mapping.stereo.stereo`.
         frames: they were made from; they give the colours.
         voxel_m: at most one point per cube of this side; None takes the median ground sampling distance of the maps.
-        single: keep points that only one pair has seen. At 30 % overlap they are half the map.
+        single: keep points that only one pair has seen, with a low confidence. At 30 % overlap they are half the map.
         progress: called with (maps done, maps in all).
 
     Returns:
@@ -94,7 +94,7 @@ def _cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     unit = float(np.median((data["sigma"] / depth**2)[known])) if known.any() else 1.0
     steps = np.clip(np.where(known, (1 / np.where(known, depth, middle) - 1 / middle) / unit, -30000), -30000, 30000)
     labels = steps.astype(np.int16)
-    cv2.filterSpeckles(labels, -30000, ISLAND, 5)
+    cv2.filterSpeckles(labels, -30000, ISLAND, 8)
     depth = np.where(known & (labels > -30000), depth, np.float32(np.nan))
     return {**data, "depth": depth}
 
@@ -128,21 +128,22 @@ def _points(
         w = np.where(same, 1 / spread**2, 0)
         total += w
         mean += np.where(same, w * found, 0)
-    # Another frame's own map must agree, and more of them than look through the point: pairs that agree in this frame
-    # alone may share one mistake.
-    known = (agree >= (1 if single else 2)) & (agree > deny)
+    # One pair alone must at least agree with itself, seen from its other frame.
+    votes = np.maximum(agree, data["support"])
+    known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = unproject(pixels, merged, own.camera, own.world_from_camera)
+    votes = votes[fresh]
     image = _undistorted(frames[own.name], own)
     cloud = Cloud(
         points,
         image[rows, columns],
-        confidence=_confidence(agree[fresh], deny[fresh], seen[fresh], data["score"][fresh]),
+        confidence=_confidence(votes, agree[fresh], data["score"][fresh]),
         sigma_m=spread.astype(np.float32),
-        views=1 + agree[fresh],
+        views=(1 + votes).astype(np.uint8),
         predicted=np.zeros(len(points), bool),
     )
     gsd = float(np.median(merged)) / own.camera.fx if len(merged) else float("nan")
@@ -192,15 +193,10 @@ def _undistorted(frame: Frame, own: DepthMap) -> NDArray[np.uint8]:
     return np.asarray(cv2.undistort(image, matrix, lens.distortion))
 
 
-def _confidence(agree: NDArray, deny: NDArray, seen: NDArray, score: NDArray) -> NDArray[np.float32]:
-    """Share of such points within three ground pixels of the surface, as counted on rendered flights.
-
-    Args:
-        agree, deny, seen: partners that confirm the point, look through it, and have it inside [N].
-        score: correlation [N].
-    """
-    base = np.select([(agree >= 2) & (deny == 0), (agree == 1) & (seen == 1)], [0.98, 0.93], 0.87)
-    return np.clip(base * (0.82 + 0.2 * score), 0, 1).astype(np.float32)
+def _confidence(votes: NDArray, agree: NDArray, score: NDArray) -> NDArray[np.float32]:
+    """0..1 from the number of confirming pairs and maps and the correlation."""
+    base = np.select([(votes <= 1) & (agree == 0), agree == 0, agree == 1], [0.45, 0.7, 0.85], 0.95)
+    return (base * np.clip(0.4 + 0.7 * score, 0, 1)).astype(np.float32)
 
 
 def _accompanied(points: NDArray, size: float) -> NDArray[np.bool_]:

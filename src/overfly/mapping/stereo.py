@@ -33,8 +33,8 @@ BASE_TO_HEIGHT = (0.04, 0.9)
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels of the matched (half) size."""
 
-REFINED_SIGMA = 0.4
-"""The same after refinement, pixels of the full size, where the windows correlate fully; the worse, the more."""
+REFINED_SIGMA = 0.25
+"""The same after refinement, pixels of the full size."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ def _depth(
         support = cv2.resize(support, size, interpolation=cv2.INTER_NEAREST)
         refined = refine(flight.shot(i), [flight.shot(j) for j in chosen], full, steps=(-1, -0.5, 0, 0.5, 1), best=2)
         full, score = refined.depth, refined.score
-        sigma = refined.step * np.float32(REFINED_SIGMA) / np.clip(score, 0.25, 1)
+        sigma = refined.step * np.float32(REFINED_SIGMA)
         support[~np.isfinite(full)] = 0
     else:
         full = np.full(size[::-1], np.nan, np.float32)
