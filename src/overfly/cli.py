@@ -56,7 +56,7 @@ def fly(
     """Photograph a landscape whose geometry is known: a flight folder with exact cameras and a reference cloud."""
     from overfly.flights import fly as fly_over
 
-    fly_over(
+    plan, _ = fly_over(
         scene,
         out=out,
         flight_path=path,
@@ -72,6 +72,7 @@ def fly(
         noise=noise,
         processes=processes,
     )
+    print(plan.summary())
 
 
 @app.command("map")
