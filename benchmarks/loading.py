@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_dir
 
-from overfly.run import build, conf_dir, register_resolvers
+from overfly.configuration import build, conf_dir, register_resolvers
 
 
 def main() -> None:

@@ -12,8 +12,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import get_class, get_method
 from omegaconf import DictConfig, OmegaConf
 
+from overfly.configuration import build, check, conf_dir, register_resolvers
 from overfly.errors import InputError
-from overfly.run import build, check, conf_dir, register_resolvers
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().glob("*/*.yaml"))

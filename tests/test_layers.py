@@ -11,7 +11,7 @@ import overfly
 PACKAGE = Path(overfly.__file__).parent
 ORDER = [
     ["__init__", "errors", "tables"],
-    ["geometry"],
+    ["geometry", "geodesy"],
     ["ply", "files", "cloud", "mesh"],
     ["losses", "metrics"],
     ["scenes"],
@@ -21,7 +21,7 @@ ORDER = [
     ["stages"],
     ["callbacks"],
     ["mapping"],
-    ["summary", "run_folder", "run"],
+    ["configuration", "summary", "run_folder", "run"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
@@ -70,4 +70,4 @@ def test_optional_packages_are_not_imported_at_the_top_of_a_module() -> None:
 
 def test_only_run_and_the_summary_of_sweeps_know_hydra() -> None:
     knows = {place(path) for path in modules() if any(name.split(".")[0] == "hydra" for name in imported(path))}
-    assert knows <= {"run", "summary"}
+    assert knows <= {"configuration", "run", "summary"}

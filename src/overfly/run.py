@@ -1,4 +1,4 @@
-"""Experiments: from a configuration to a run folder. The only module that knows Hydra.
+"""Experiments: from a configuration to a run folder. With :mod:`overfly.configuration` the only place that knows Hydra.
 
 A run folder is movable and holds ``config.yaml``, ``overrides.txt``, ``train.log``, ``metrics.csv``, ``metrics.json``,
 ``checkpoints/best.ckpt``, ``curves.png`` and ``clouds/``. A run of ``stage=all`` holds one such folder for each phase
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from overfly.configuration import build, check, conf_dir, explain, register_resolvers, save
 from overfly.errors import InputError
 from overfly.run_folder import checkpoint, collect, read_weights, resumed, write_json
 
@@ -28,65 +29,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("overfly")
 
-BOUNDS = {"altitude": (20, 500), "overlap": (0, 95), "side_overlap": (0, 95)}
-UNITS = {"altitude": "metres above ground", "overlap": "percent", "side_overlap": "percent"}
-
-
-def conf_dir() -> Path:
-    """The folder of configurations: inside the installed package, else beside the source tree."""
-    here = Path(__file__).resolve().parent
-    return next(folder for folder in (here / "conf", here.parents[1] / "conf") if folder.is_dir())
-
-
-def register_resolvers() -> None:
-    """``${overfly.slug:text}`` makes a folder name, ``${overfly.user_cache:}`` names the user's cache folder."""
-
-    def slug(text: str) -> str:
-        kept = "".join(c if c.isalnum() or c in ".-_" else "-" for c in str(text).replace("=", "-"))
-        return kept[:80] or "run"
-
-    def user_cache() -> str:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        return str(Path(base) / "overfly")
-
-    OmegaConf.register_new_resolver("overfly.slug", slug, replace=True)
-    OmegaConf.register_new_resolver("overfly.user_cache", user_cache, replace=True)
-
-
-def check(cfg: DictConfig) -> None:
-    """Refuse values that no flight can have.
-
-    Raises:
-        InputError: ``altitude``, ``overlap`` or ``side_overlap`` is no number or out of bounds.
-    """
-    for key, (low, high) in BOUNDS.items():
-        values = cfg[key] if OmegaConf.is_list(cfg[key]) else [cfg[key]]
-        for value in values:
-            if value is None and key == "side_overlap":
-                continue
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not (low <= value <= high):
-                raise InputError(
-                    f"{key}={value} is not possible: give {UNITS[key]}, a number from {low} to {high} "
-                    f"(or a list of them), for instance {key}={(low + high) // 2}."
-                )
-    if not isinstance(cfg.frames, int) or not 1 <= cfg.frames <= 8:
-        raise InputError(f"frames={cfg.frames} is not possible: a window has 1 to 8 frames, for instance frames=3.")
-
-
-def build(cfg: Any) -> Any:
-    """Instantiate a part of the configuration, nested parts included: the one call of Hydra's ``instantiate``."""
-    from hydra.utils import instantiate
-
-    return instantiate(cfg, _convert_="all")
-
 
 def train(cfg: DictConfig) -> float | None:
     """Train what ``stage`` says and return the best value of the monitored metric (None if none was measured)."""
     check(cfg)
     run_dir = Path(cfg.run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
-    _save_config(cfg, run_dir)
+    save(cfg, run_dir)
     log.info("The run folder is %s", run_dir)
     if cfg.stage_name == "compare":
         return _compare(cfg, run_dir)
@@ -102,7 +51,7 @@ def train(cfg: DictConfig) -> float | None:
             value = json.loads(done.read_text()).get("monitored")
         else:
             Path(part.run_dir).mkdir(parents=True, exist_ok=True)
-            _save_config(part, Path(part.run_dir))
+            save(part, Path(part.run_dir))
             value = _train_stage(part)
         before = part.run_dir
         collect(run_dir, list(cfg.phases))
@@ -269,44 +218,6 @@ def load_run(folder: Path | str) -> Run:
     config = OmegaConf.to_container(cfg, resolve=False)
     assert isinstance(config, dict)
     return Run(folder=root, network=network.eval(), config={str(k): v for k, v in config.items()}, stage=cfg.stage_name)
-
-
-def _save_config(cfg: DictConfig, folder: Path) -> None:
-    """The configuration with every value filled in, without this machine's folders, so that the run can be moved."""
-    from hydra.core.hydra_config import HydraConfig
-
-    resolved = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
-    assert isinstance(resolved, DictConfig)
-    OmegaConf.set_struct(resolved, False)
-    for key in ("phases", "sweep"):
-        resolved.pop(key, None)
-    resolved.run_dir = "."
-    if cfg.from_run is not None and Path(cfg.from_run).parent == folder.parent:
-        resolved.from_run = f"../{Path(cfg.from_run).name}"  # the phase before, which moves along
-    OmegaConf.resolve(resolved) if cfg.stage is not None else None
-    OmegaConf.save(resolved, folder / "config.yaml")
-    if HydraConfig.initialized():
-        overrides = HydraConfig.get().overrides.task
-        (folder / "overrides.txt").write_text("".join(f"{item}\n" for item in overrides))
-
-
-def explain(error: BaseException) -> str | None:
-    """One sentence for what the user can mend: what was given, and what is allowed. None for a bug."""
-    from hydra.errors import ConfigCompositionException, MissingConfigException
-    from omegaconf.errors import OmegaConfBaseException
-
-    chain: list[BaseException] = [error]
-    while (cause := chain[-1].__cause__) is not None:
-        chain.append(cause)
-    for link in chain:
-        if isinstance(link, InputError):
-            return str(link)
-    text = " ".join(" ".join(str(link).split()) for link in chain[:2])
-    if isinstance(error, MissingConfigException):
-        return text
-    if isinstance(error, ConfigCompositionException | OmegaConfBaseException):
-        return f"The configuration refuses this: {text}. Type `python train.py --cfg job` to see every key."
-    return None
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from overfly.data.footprints import REACH, area, choose_frames, footprint, ground_overlaps, intersection, sees
+from overfly.data.footprints import REACH, choose_frames, footprint, ground_overlaps, sees
 from overfly.geometry import Camera, pose, project, rotation_from_gimbal
 
 SQUARE = Camera.from_fov(100, 100, 90)  # at 50 m the footprint is 100 m x 100 m
@@ -28,16 +28,6 @@ def test_footprint_ends_at_reach_towards_the_horizon_and_is_nan_in_the_sky() -> 
     np.testing.assert_allclose(np.linalg.norm(far[:2], axis=1), REACH * 50)
     assert np.isnan(footprint(SQUARE, pose(rotation_from_gimbal(0, 80), [0, 0, 50]), 0.0)).all()
     assert np.isnan(footprint(SQUARE, nadir(0, 0, -5), 0.0)).all()
-
-
-def test_intersection_area_by_hand() -> None:
-    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
-    assert area(intersection(unit, unit + np.array([0.25, 0.5]))) == pytest.approx(0.75 * 0.5)
-    assert area(intersection(unit, unit[::-1])) == pytest.approx(1)
-    assert len(intersection(unit, unit + 5)) == 0
-    diamond = np.array([[0.5, -0.5], [1.5, 0.5], [0.5, 1.5], [-0.5, 0.5]])
-    assert area(intersection(unit, diamond)) == pytest.approx(1)
-    assert area(intersection(unit + 5e6, unit + 5e6)) == pytest.approx(1)
 
 
 def test_overlaps_by_hand_and_against_counted_points() -> None:

@@ -10,7 +10,8 @@ from small_flight import CAMERA, ORIGIN, some_poses, textured
 
 from overfly.flights.flight import Frame
 from overfly.flights.write import write_flight
-from overfly.geometry import Camera, Origin
+from overfly.geodesy import Origin
+from overfly.geometry import Camera
 
 
 @pytest.fixture

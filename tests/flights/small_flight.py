@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from overfly.geometry import Camera, Origin, pose, rotation_from_gimbal
+from overfly.geodesy import Origin
+from overfly.geometry import Camera, pose, rotation_from_gimbal
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 ORIGIN = Origin(46.0, 8.0, 450.0)

@@ -16,7 +16,8 @@ from overfly.flights.exif import exif_bytes
 from overfly.flights.flight import Gps
 from overfly.flights.folder import read_flight
 from overfly.flights.write import FIRST_FRAME_TIME
-from overfly.geometry import enu_from_geodetic, gimbal_from_rotation
+from overfly.geodesy import enu_from_geodetic
+from overfly.geometry import gimbal_from_rotation
 
 
 def save(path, seed=0, size=(48, 64), **more):

@@ -16,7 +16,8 @@ from overfly.flights.flight import Frame
 from overfly.flights.folder import read_flight
 from overfly.flights.odm import read_gcps, read_geo
 from overfly.flights.transforms import read_transforms, write_transforms
-from overfly.geometry import Camera, Origin, invert, project
+from overfly.geodesy import Origin
+from overfly.geometry import Camera, invert, project
 
 LENS = Camera(64, 48, 50.0, 51.0, 31.0, 25.0, -0.1, 0.02, 0.001, -0.002, 0.003)
 

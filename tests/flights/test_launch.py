@@ -13,7 +13,7 @@ from overfly.flights import fly, read_flight
 from overfly.flights.cameras import camera_preset
 from overfly.flights.launch import default_area
 from overfly.flights.reference import seen
-from overfly.geometry import enu_from_geodetic
+from overfly.geodesy import enu_from_geodetic
 
 SMALL = {"width": 96, "altitude": 60, "frames": 6, "overlap": 60, "reference_points": 3000, "supersample": 1}
 

@@ -9,7 +9,8 @@ import pytest
 
 from overfly.flights.colmap import read_colmap
 from overfly.flights.folder import read_flight
-from overfly.geometry import Origin, enu_from_geodetic, project
+from overfly.geodesy import Origin, enu_from_geodetic
+from overfly.geometry import project
 
 SETS = {"brighton_beach": 18, "warsaw_ochota_low": 39, "tampa_sheffield_cross": 60, "boruszyn_kap": 28}
 

@@ -10,17 +10,8 @@ import numpy as np
 import pytest
 
 from overfly.flights import Flight, Frame, Gps
-from overfly.geometry import (
-    Array,
-    Camera,
-    Origin,
-    geodetic_from_enu,
-    on_plane,
-    pixel_grid,
-    pose,
-    rays,
-    rotation_from_gimbal,
-)
+from overfly.geodesy import Origin, geodetic_from_enu
+from overfly.geometry import Array, Camera, on_plane, pixel_grid, pose, rays, rotation_from_gimbal
 
 ORIGIN = Origin(52.2, 21.0, 100.0)
 

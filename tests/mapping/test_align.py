@@ -13,7 +13,8 @@ import pytest
 
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame, read_flight
-from overfly.geometry import Origin, enu_from_geodetic, fit_similarity, geodetic_from_enu, transform
+from overfly.geodesy import Origin, enu_from_geodetic, geodetic_from_enu
+from overfly.geometry import fit_similarity, transform
 from overfly.mapping.align import align
 from overfly.mapping.database import focal_px
 from overfly.mapping.features import image_pairs

@@ -18,17 +18,8 @@ from PIL import Image
 
 from overfly.cloud import Cloud, read_cloud
 from overfly.errors import InputError
-from overfly.geometry import (
-    OPENCV_FROM_OPENGL,
-    Camera,
-    Origin,
-    crs_from_enu,
-    on_plane,
-    pixel_grid,
-    pose,
-    rotation_from_gimbal,
-    transform,
-)
+from overfly.geodesy import Origin, crs_from_enu
+from overfly.geometry import OPENCV_FROM_OPENGL, Camera, on_plane, pixel_grid, pose, rotation_from_gimbal, transform
 from overfly.mapping.map import map_flight
 from overfly.mapping.settings import MapSettings
 

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from overfly.cloud import Cloud, read_cloud
 from overfly.errors import InputError
-from overfly.geometry import Origin, crs_from_enu, invert, transform
+from overfly.geodesy import Origin, crs_from_enu
+from overfly.geometry import invert, transform
 from overfly.metrics.alignment import MODES, align
 from overfly.metrics.functional import distances
 

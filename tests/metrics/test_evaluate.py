@@ -11,7 +11,7 @@ from rich.console import Console
 
 from overfly.cloud import Cloud, read_cloud, write_cloud
 from overfly.errors import InputError
-from overfly.geometry import Origin, crs_from_enu
+from overfly.geodesy import Origin, crs_from_enu
 from overfly.metrics import functional as f
 from overfly.metrics.evaluate import evaluate, format_table
 

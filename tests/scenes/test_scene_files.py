@@ -9,7 +9,8 @@ import pytest
 
 from overfly.cloud import Cloud, write_cloud
 from overfly.errors import InputError
-from overfly.geometry import Camera, enu_from_crs, look_at
+from overfly.geodesy import enu_from_crs
+from overfly.geometry import Camera, look_at
 from overfly.mesh import Mesh, write_mesh
 from overfly.scenes import Appearance, Renderer, load_scene
 

@@ -150,7 +150,7 @@ def _shift(scene: Scene, flight: Flight) -> NDArray[np.float64]:
             f"The reference has a CRS, but the cameras of {flight.root} have no geographic origin: "
             "give a reference in the cameras' local frame."
         )
-    from overfly.geometry import enu_from_geodetic
+    from overfly.geodesy import enu_from_geodetic
 
     place = scene.origin
     # Both frames point east, north, up; over one flight the axes of two places differ by less than 1 mm a metre.

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from overfly.flights.footprint import meet_ground, polygons
 from overfly.geometry import Array, Camera, pixel_grid, project, rays
 
 REACH = 4.0
@@ -27,73 +29,34 @@ def footprint(camera: Camera, world_from_camera: ArrayLike, ground_height: float
         camera stands under the plane or sees nothing of it.
     """
     pose = np.asarray(world_from_camera, float)
-    altitude = pose[2, 3] - ground_height
     w, h = camera.width, camera.height
     directions = rays([[0, 0], [w, 0], [w, h], [0, h]], camera) @ pose[:3, :3].T  # [4, 3]
-    if altitude <= 0 or (directions[:, 2] >= 0).all():
+    if pose[2, 3] <= ground_height or (directions[:, 2] >= 0).all():
         return np.full((4, 2), np.nan)
-    flat = np.linalg.norm(directions[:, :2], axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        on_ground = np.where(directions[:, 2] < 0, altitude / -directions[:, 2], np.inf)
-        at_reach = np.where(flat > 0, reach * altitude / flat, np.inf)
-    return pose[:2, 3] + directions[:, :2] * np.minimum(on_ground, at_reach)[:, None]
-
-
-def area(polygon: ArrayLike) -> float:
-    """The area of a polygon [n, 2] (shoelace formula); 0 for NaN or fewer than three corners."""
-    points = np.asarray(polygon, float)
-    if len(points) < 3 or not np.isfinite(points).all():
-        return 0.0
-    x, y = (points - points[0]).T  # against cancellation at large coordinates
-    return float(abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)
-
-
-def intersection(polygon: ArrayLike, convex: ArrayLike) -> Array:
-    """The part of ``polygon`` [n, 2] inside the ``convex`` polygon [m, 2]: corners [k, 2], k = 0 where apart.
-
-    Sutherland and Hodgman, "Reentrant polygon clipping" (1974).
-    """
-    clip = np.asarray(convex, float)
-    x, y = (clip - clip[0]).T
-    if np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)) < 0:
-        clip = clip[::-1]  # counter-clockwise
-    corners = [tuple(p) for p in np.asarray(polygon, float).tolist()]
-    edges = clip.tolist()
-    for (ax, ay), (bx, by) in zip(edges, edges[1:] + edges[:1], strict=True):
-        kept: list[tuple[float, float]] = []
-        side = [(bx - ax) * (py - ay) - (by - ay) * (px - ax) for px, py in corners]
-        for i, (point, s) in enumerate(zip(corners, side, strict=True)):
-            before, s_before = corners[i - 1], side[i - 1]
-            if (s >= 0) != (s_before >= 0):
-                t = s_before / (s_before - s)
-                kept.append((before[0] + t * (point[0] - before[0]), before[1] + t * (point[1] - before[1])))
-            if s >= 0:
-                kept.append(point)
-        corners = kept
-        if not corners:
-            break
-    return np.array(corners, float).reshape(-1, 2)
+    origins = np.broadcast_to(pose[:3, 3], directions.shape)
+    level = (ground_height, ground_height)
+    return meet_ground(origins, directions, lambda xy: np.full(len(xy), ground_height), level, reach)[:, :2]
 
 
 def ground_overlaps(footprints: ArrayLike) -> Array:
     """Share of footprint i that lies inside footprint j.
 
     Args:
-        footprints: [n, 4, 2] convex outlines, see :func:`footprint`; NaN sees nothing.
+        footprints: [n, 4, 2] outlines, see :func:`footprint`; NaN sees nothing.
 
     Returns:
         [n, n] in 0..1, 1 on the diagonal; symmetric only where the footprints have equal areas.
     """
     outlines = np.asarray(footprints, float)
-    areas = np.array([area(p) for p in outlines])
-    low, high = outlines.min(1), outlines.max(1)
-    with np.errstate(invalid="ignore"):
-        near = ((low[:, None] < high[None]) & (low[None] < high[:, None])).all(-1)
+    seeing = np.flatnonzero(np.isfinite(outlines).all((1, 2)))
+    shapes = polygons(outlines[seeing])
     overlaps = np.eye(len(outlines))
-    for i, j in np.argwhere(np.triu(near, 1)):
-        common = area(intersection(outlines[i], outlines[j]))
-        if common > 0:
-            overlaps[i, j], overlaps[j, i] = common / areas[i], common / areas[j]
+    if len(seeing):
+        a, b = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+        overlaps[seeing[a], seeing[b]] = shapely.area(shapely.intersection(shapes[a], shapes[b])) / shapely.area(
+            shapes[a]
+        )
+        overlaps[np.diag_indices(len(outlines))] = 1
     return np.clip(overlaps, 0, 1)
 
 

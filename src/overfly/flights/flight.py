@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.errors import InputError
-from overfly.geometry import Array, Camera, Origin
+from overfly.geodesy import Origin
+from overfly.geometry import Array, Camera
 
 
 @dataclass(frozen=True)

@@ -29,23 +29,26 @@ def border_pixels(camera: Camera, per_side: int = 8) -> Array:
     return np.concatenate([np.stack(side, axis=-1) for side in sides])
 
 
-def meet_ground(origins: Array, directions: Array, ground: Ground, height_range: tuple[float, float]) -> Array:
+def meet_ground(
+    origins: Array, directions: Array, ground: Ground, height_range: tuple[float, float], reach: float = REACH
+) -> Array:
     """Where rays first meet the terrain.
 
     Args:
         origins, directions: [N, 3], world.
         ground: the terrain.
         height_range: its lowest and highest z; below the lowest a ray ends on that plane.
+        reach: where rays end that meet no ground, in heights over the lowest ground, sideways.
 
     Returns:
         Points [N, 3]; hills thinner than :data:`MARCH_M` (long rays: 1/24 of the way through the terrain's heights)
-        can be jumped over. A ray that reaches :data:`REACH` heights sideways without meeting ground ends there.
+        can be jumped over.
     """
     low, high = height_range
     height = np.maximum(origins[:, 2] - low, 1e-6)
     flat = np.linalg.norm(directions[:, :2], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        limit = np.where(flat > 0, REACH * height / flat, np.inf)
+        limit = np.where(flat > 0, reach * height / flat, np.inf)
         down = directions[:, 2] < 0
         end = np.minimum(np.where(down, -height / directions[:, 2], np.inf), limit)
         start = np.where(down, np.maximum(origins[:, 2] - high, 0) / np.maximum(-directions[:, 2], 1e-12), 0.0)

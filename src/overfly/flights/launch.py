@@ -23,7 +23,8 @@ from overfly.flights.render import render_frames, stamps_of, write_reference
 from overfly.flights.site import Area, Site
 from overfly.flights.transforms import write_transforms
 from overfly.flights.write import frame_name, stamped_frame
-from overfly.geometry import Array, Camera, Origin
+from overfly.geodesy import Origin
+from overfly.geometry import Array, Camera
 
 if TYPE_CHECKING:
     from overfly.scenes import Appearance, Scene

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from overfly.errors import InputError, unknown
 from overfly.flights.transforms import Cameras
-from overfly.geometry import Camera, Origin, invert, pose
+from overfly.geodesy import Origin
+from overfly.geometry import Camera, invert, pose
 
 PROJECTIONS = ("perspective", "brown", "simple_radial", "radial")
 

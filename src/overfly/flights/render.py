@@ -20,7 +20,8 @@ from overfly.flights.plan import Plan
 from overfly.flights.reference import reference_cloud
 from overfly.flights.site import Site
 from overfly.flights.write import Stamp, frame_name, remove_leftovers, write_frame
-from overfly.geometry import Array, Camera, Origin, gimbal_from_rotation
+from overfly.geodesy import Origin
+from overfly.geometry import Array, Camera, gimbal_from_rotation
 
 if TYPE_CHECKING:
     from overfly.scenes import Appearance, Scene

@@ -16,7 +16,8 @@ from overfly.errors import InputError, unknown
 from overfly.files import replacing
 from overfly.flights.flight import Frame
 from overfly.flights.images import SUFFIXES
-from overfly.geometry import OPENCV_FROM_OPENGL, Array, Camera, Origin, is_rotation
+from overfly.geodesy import Origin
+from overfly.geometry import OPENCV_FROM_OPENGL, Array, Camera, is_rotation
 
 CAMERA_MODELS = ("PINHOLE", "OPENCV", "SIMPLE_PINHOLE")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "k3", "camera_angle_x", "camera_model")

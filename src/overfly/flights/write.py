@@ -17,7 +17,8 @@ from overfly.flights.cameras import focal35_mm
 from overfly.flights.exif import exif_bytes, xmp_bytes
 from overfly.flights.flight import Frame, Gps
 from overfly.flights.transforms import write_transforms
-from overfly.geometry import Array, Camera, Origin, geodetic_from_enu, gimbal_from_rotation
+from overfly.geodesy import Origin, geodetic_from_enu
+from overfly.geometry import Array, Camera, gimbal_from_rotation
 
 FIRST_FRAME_TIME = datetime(2026, 6, 21, 11, 0, 0)
 """Time stamps of synthetic frames start here and go on every second: the same flight is the same file."""

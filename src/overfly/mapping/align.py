@@ -12,7 +12,8 @@ import numpy as np
 
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
-from overfly.geometry import Array, Camera, Origin, enu_from_geodetic, pose
+from overfly.geodesy import Origin, enu_from_geodetic
+from overfly.geometry import Array, Camera, pose
 from overfly.mapping.block import Block
 from overfly.mapping.database import focal_px, match_pairs, open_database, strongest_pair
 from overfly.mapping.features import features, image_pairs

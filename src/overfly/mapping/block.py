@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from overfly.cloud import Cloud
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
-from overfly.geometry import Array, Camera, Origin, enu_from_geodetic
+from overfly.geodesy import Origin, enu_from_geodetic
+from overfly.geometry import Array, Camera
 
 
 @dataclass(frozen=True, eq=False)

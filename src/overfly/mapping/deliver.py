@@ -13,7 +13,8 @@ from overfly.cloud import Cloud, write_cloud
 from overfly.errors import InputError
 from overfly.files import replacing
 from overfly.flights import Flight, Frame, write_transforms
-from overfly.geometry import crs_from_enu, transform
+from overfly.geodesy import crs_from_enu
+from overfly.geometry import transform
 from overfly.mapping.block import Block
 from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground

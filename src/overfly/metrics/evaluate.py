@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from overfly.cloud import Cloud, read_cloud, voxel_thin
 from overfly.errors import InputError, unknown
-from overfly.geometry import Origin, crs_from_enu
+from overfly.geodesy import Origin, crs_from_enu
 from overfly.metrics import alignment
 from overfly.metrics.functional import (
     GSD_MULTIPLES,

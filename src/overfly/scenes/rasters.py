@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.errors import InputError
-from overfly.geometry import Origin, enu_from_crs
+from overfly.geodesy import Origin, enu_from_crs
 from overfly.scenes import materials as m
 from overfly.scenes.envelope import lower_envelope, nearest_fill
 from overfly.scenes.scene import Scene

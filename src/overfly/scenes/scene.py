@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from overfly.errors import InputError, unknown
-from overfly.geometry import Origin
+from overfly.geodesy import Origin
 
 STYLES = ("campus", "blocks", "suburb", "village", "industrial", "vegetation")
 """The procedural landscapes that :func:`make_scene` can build."""
