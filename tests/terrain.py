@@ -83,6 +83,7 @@ def _window(rng, frames, width, height, relief, points):
         "scale": np.array(50.0),
         "gsd": np.array(100.0 / width),
         "altitude": np.array(100.0),
+        "height_range": np.array([-0.8, 0.8]),
     }
 
 
@@ -100,3 +101,26 @@ def make_network(**changes):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return GanDecoder(**{"size": [64, 32], "points": 256, "features": 32, **parts, **changes})
+
+
+def make_sweep_network(**changes):
+    """A tiny SweepDecoder for images of 64 x 32 pixels, with the same random weights every time."""
+    from overfly.networks import SweepDecoder
+
+    parts = {
+        "encoder": {"widths": [8, 8, 8, 16], "descriptor": 16, "match_channels": 8, "correction_width": 16},
+        "generator": {
+            "hypotheses": 12,
+            "groups": 2,
+            "coarse_widths": [16, 16],
+            "fine_hypotheses": 5,
+            "fine_step": 0.5,
+            "fine_width": 16,
+        },
+        "discriminator": {"widths": [8, 16], "strides": [1, 4], "head_width": 8},
+    }
+    for name in parts:
+        parts[name] |= changes.pop(name, {})
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return SweepDecoder(**{"size": [64, 32], "points": 256, "features": 32, **parts, **changes})

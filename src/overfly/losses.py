@@ -127,6 +127,38 @@ def correction(predicted: Tensor, true: Tensor, beta: float = 0.01) -> Tensor:
     return torch.nn.functional.smooth_l1_loss(predicted, true, beta=beta, reduction="none").sum(-1)
 
 
+def height(predicted: Tensor, true: Tensor, beta: float = 0.02) -> Tensor:
+    """Smooth L1 between heights in window units, elementwise; quadratic below ``beta``, 1 % of the footprint."""
+    return torch.nn.functional.smooth_l1_loss(predicted, true, beta=beta, reduction="none")
+
+
+def hypotheses(logits: Tensor, heights: Tensor, true: Tensor) -> Tensor:
+    """Cross-entropy of the hypotheses' probabilities; the two heights around the truth share the right answer.
+
+    Args:
+        logits, heights: [B, D, ...], evenly spaced along D.
+        true: [B, ...]; beyond the first or last height that one is right.
+
+    Returns:
+        [B, ...], nats.
+    """
+    step = heights[:, 1] - heights[:, 0]
+    place = ((true - heights[:, 0]) / step).clamp(0, heights.shape[1] - 1)
+    index = torch.arange(heights.shape[1], device=logits.device).reshape(-1, *[1] * (true.ndim - 1))
+    share = (1 - (index - place[:, None]).abs()).clamp(min=0)
+    return -(share * logits.log_softmax(1)).sum(1)
+
+
+def sigma(log_sigma: Tensor, error: Tensor) -> Tensor:
+    """Negative log-likelihood of absolute errors under a Laplace distribution of expected error exp(log_sigma)."""
+    return log_sigma + error.abs() * (-log_sigma).exp()
+
+
+def confidence(logits: Tensor, right: Tensor) -> Tensor:
+    """Binary cross-entropy of the probability that a point is right (``right`` bool), elementwise."""
+    return torch.nn.functional.binary_cross_entropy_with_logits(logits, right.to(logits.dtype), reduction="none")
+
+
 def adversarial(generated: Tensor) -> Tensor:
     """The generator's non-saturating loss -log D(G) (Goodfellow et al. 2014) from logits [B] -> [B]."""
     return torch.nn.functional.softplus(-generated)

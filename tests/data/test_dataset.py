@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,24 @@ import torch
 from plane import CAMERA, make_record, surface
 
 from overfly.data.dataset import WindowDataset, WindowSampler, WindowSettings, reference_points
+from overfly.data.footprints import footprint
 from overfly.data.record import write_record
 from overfly.data.windows import to_world, window_frame
 from overfly.errors import InputError
 
-SETTINGS = WindowSettings(
-    frames=3, points=256, choice="overlap", ground_sigma_m=0.0, position_sigma_m=1.0, rotation_sigma_deg=1.0
+EXACT = WindowSettings(
+    frames=3,
+    points=256,
+    choice="overlap",
+    ground_sigma_m=0.0,
+    position_sigma_m=0.0,
+    rotation_sigma_deg=0.0,
+    shrink=1,
+    drop_share=0.0,
+    light_sigma=0.0,
+    camera_sigma_px=0.0,
 )
+SETTINGS = replace(EXACT, position_sigma_m=1.0, rotation_sigma_deg=1.0)
 
 
 def dataset(folder: Path, augment: bool = True, seed: int = 5) -> WindowDataset:
@@ -40,8 +52,8 @@ def test_reference_and_depth_are_the_same_surface(record_folder: Path) -> None:
     points = item["reference"].numpy().astype(float)
     # The camera faces north, so window axes are the world's; the frame stands over x = 0.
     np.testing.assert_allclose(points[:, 2] * scale, surface(points * scale), atol=0.06)
-    assert points[:, :2].min() > -1
-    assert points[:, :2].max() < 1
+    assert np.abs(points[:, 0]).max() == pytest.approx(1, abs=0.05)
+    assert np.abs(points[:, 1]).max() == pytest.approx(24 / 32, abs=0.05)  # the footprint has the image's shape
     # Each point projected into the first frame meets the depth map there.
     camera = item["camera_from_window"][0].numpy().astype(float)
     local = points @ camera[:3, :3].T + camera[:3, 3]
@@ -76,9 +88,7 @@ def test_priors_are_wrong_by_what_was_asked(record_folder: Path) -> None:
 
 def test_consecutive_windows_follow_time(tmp_path: Path) -> None:
     write_record(make_record(), tmp_path / "r")
-    settings = WindowSettings(
-        frames=3, points=16, choice="consecutive", ground_sigma_m=0, position_sigma_m=0, rotation_sigma_deg=0
-    )
+    settings = replace(EXACT, choice="consecutive")
     windows = [window for _, window in WindowDataset([tmp_path / "r"], settings, seed=0, augment=False).windows]
     assert windows == [[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5], [4, 3, 5], [5, 3, 4]]
 
@@ -86,15 +96,16 @@ def test_consecutive_windows_follow_time(tmp_path: Path) -> None:
 def test_a_reference_that_misses_the_window_is_an_error() -> None:
     record = make_record()
     frame, scale = window_frame(CAMERA, record.world_from_camera[0], 0.0)
-    frame[0, 3] = 5000
+    area = footprint(CAMERA, record.world_from_camera[0], 0.0) + 5000
     with pytest.raises(InputError, match="less than a tenth"):
-        reference_points(record, frame, scale, 64, np.random.default_rng(0))
+        reference_points(record, area, frame, scale, 64, np.random.default_rng(0))
 
 
 def test_points_keep_their_metres(record_folder: Path) -> None:
     record = make_record()
     frame, scale = window_frame(CAMERA, record.world_from_camera[2], 0.0)
-    points = reference_points(record, frame, scale, 64, np.random.default_rng(0))
+    area = footprint(CAMERA, record.world_from_camera[2], 0.0)
+    points = reference_points(record, area, frame, scale, 64, np.random.default_rng(0))
     world = to_world(points, frame, scale)
     np.testing.assert_allclose(world[:, 2], surface(world), atol=0.06)
     width = 2 * 100 * np.tan(np.radians(35))  # of the footprint of a 70 degree camera at 100 m
@@ -103,7 +114,7 @@ def test_points_keep_their_metres(record_folder: Path) -> None:
 
 def test_an_unknown_choice_is_an_error() -> None:
     with pytest.raises(InputError, match="overlap or consecutive"):
-        WindowSettings(frames=3, points=1, choice="best", ground_sigma_m=0, position_sigma_m=0, rotation_sigma_deg=0)
+        replace(EXACT, choice="best")
 
 
 @pytest.mark.parametrize("world", [1, 3])

@@ -120,6 +120,7 @@ def test_sample_has_the_contracts_shapes() -> None:
     assert shapes == {
         "images": (3, 3, 24, 32), "intrinsics": (3, 3, 3), "camera_from_window": (3, 4, 4),
         "prior_from_window": (3, 4, 4), "overlaps": (3, 3), "scale": (), "gsd": (), "altitude": (),
+            "height_range": (2,),
     }  # fmt: skip
     assert all(v.dtype == np.float32 for v in sample.values())
     assert sample["images"][2].max() == 1

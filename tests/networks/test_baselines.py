@@ -4,25 +4,19 @@ import pytest
 import torch
 
 from overfly.errors import InputError
-from overfly.networks.baselines import NearestWindow, flat_ground, mean_cloud
-from overfly.networks.blocks import initial_cloud
+from overfly.networks.baselines import NearestWindow, lifted, mean_heights
+from overfly.networks.ground import initial_cloud
+from terrain import make_batch
 
 
-def lifted(height: float) -> torch.Tensor:
-    cloud = initial_cloud(16).clone()
-    cloud[:, 2] = height + (cloud[:, 0] > 0)
-    return cloud
-
-
-def test_flat_ground_is_the_initial_cloud_for_every_window() -> None:
-    assert torch.equal(flat_ground(3, 16)[2], initial_cloud(16))
-
-
-def test_mean_cloud_has_the_mean_height_of_each_place() -> None:
-    batches = [torch.stack([lifted(0.0), lifted(1.0)]), lifted(5.0)[None, torch.randperm(16)]]
-    assert torch.allclose(mean_cloud(batches, 16), lifted(2.0))
+def test_mean_heights_are_those_of_each_place() -> None:
+    first, second = make_batch(2), make_batch(1)
+    shape = (initial_cloud(16, first)[0, :, 0] > 0).float()  # every window of make_batch has the same cameras
+    first["reference"] = lifted(initial_cloud(16, first), torch.stack([shape, 1 + shape]))
+    second["reference"] = lifted(initial_cloud(16, second), 5 + shape)[:, torch.randperm(16)]
+    assert torch.allclose(mean_heights([first, second], 16), 2 + shape)
     with pytest.raises(InputError, match="training window"):
-        mean_cloud([], 16)
+        mean_heights([], 16)
 
 
 def test_nearest_window_answers_with_the_most_similar_windows_reference() -> None:

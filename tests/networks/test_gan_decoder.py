@@ -7,8 +7,8 @@ import torch
 
 from overfly.errors import InputError
 from overfly.networks import GanDecoder
-from overfly.networks.blocks import initial_cloud
 from overfly.networks.discriminator import z_order
+from overfly.networks.ground import initial_cloud
 from terrain import make_batch, make_network
 
 
@@ -34,18 +34,20 @@ def test_any_number_of_frames_gives_one_cloud(network: GanDecoder, frames: int) 
 
 
 def test_initial_cloud_is_uniform_and_flat() -> None:
-    cloud = initial_cloud(16)
-    assert torch.allclose(cloud[0], torch.tensor([-0.75, -0.75, 0]))
-    assert torch.allclose(cloud[1], torch.tensor([-0.25, -0.75, 0]))
-    assert torch.allclose(cloud[15], torch.tensor([0.75, 0.75, 0]))
+    batch = make_batch(1)
+    height, width = batch["images"].shape[-2:]
+    cloud = initial_cloud(16, batch)[0]  # from the image's top left: north-west
+    assert torch.allclose(cloud[0], torch.tensor([-0.75, 0.75 * height / width, 0]), atol=1e-5)
+    assert torch.allclose(cloud[1], torch.tensor([-0.25, 0.75 * height / width, 0]), atol=1e-5)
+    assert torch.allclose(cloud[15], torch.tensor([0.75, -0.75 * height / width, 0]), atol=1e-5)
     with pytest.raises(InputError, match="points=1024"):
-        initial_cloud(1000)
+        initial_cloud(1000, batch)
 
 
 def test_first_clouds_are_nearly_the_initial_cloud(network: GanDecoder) -> None:
     network.eval()
-    points = network(make_batch(1))["points"][0]
-    assert (points - initial_cloud(256)).abs().max() < 0.5
+    batch = make_batch(1)
+    assert (network(batch)["points"] - initial_cloud(256, batch)).abs().max() < 0.5
 
 
 def test_generator_blocks_start_as_the_encoders(network: GanDecoder) -> None:
@@ -68,10 +70,11 @@ def test_generator_of_a_width_that_the_encoder_lacks_is_refused() -> None:
 
 def test_concatenating_the_features_to_every_point_is_what_the_entry_computes(network: GanDecoder) -> None:
     generator, code = network.generator, torch.randn(1, 32)
+    initial = initial_cloud(256, make_batch(1))[0]
     weight = torch.cat([generator.from_features.weight, generator.from_point.weight], 1)
-    joined = torch.cat([code.expand(256, -1), generator.initial], 1)
+    joined = torch.cat([code.expand(256, -1), initial], 1)
     expected = joined @ weight.T + generator.from_features.bias
-    entry = generator.from_features(code)[:, None] + generator.from_point(generator.initial)
+    entry = generator.from_features(code)[:, None] + generator.from_point(initial)
     assert torch.allclose(entry[0], expected, atol=1e-6)
 
 

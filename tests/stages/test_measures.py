@@ -10,7 +10,7 @@ import torch
 from torch.nn import functional as F
 
 from overfly.metrics import ChamferM, ChamferM2, ChamferSum1024
-from overfly.networks.blocks import initial_cloud
+from overfly.networks.ground import pixel_centres
 from overfly.networks.matching import cell_pixels, true_correspondences
 from overfly.stages.clouds import window_emd, window_metrics
 from overfly.stages.compare import compare, write_comparison
@@ -19,8 +19,14 @@ from overfly.stages.supervision import correction_errors, matching_counts, overl
 from terrain import make_batch, make_network
 
 
+def unit_grid() -> np.ndarray:
+    """1024 points in a square grid over [-1, 1]^2 at height 0."""
+    cells = pixel_centres(2, 2, 32, 32, torch.device("cpu")) - 1
+    return np.column_stack([cells.numpy(), np.zeros(1024)])
+
+
 def test_window_metrics_of_a_lifted_grid() -> None:
-    grid = initial_cloud(1024).numpy()
+    grid = unit_grid()
     lifted = grid + np.array([0, 0, 0.01])
     found = window_metrics(lifted, grid, 50.0)  # 0.5 m too high; the grid's step is 3.125 m
     assert found["chamfer_m2"] == pytest.approx(2 * 0.5**2, rel=1e-4)
@@ -31,7 +37,7 @@ def test_window_metrics_of_a_lifted_grid() -> None:
 
 
 def test_near_counts_within_two_percent_of_the_footprints_width() -> None:
-    grid = initial_cloud(1024).numpy()
+    grid = unit_grid()
     half = np.where(grid[:, :1] > 0, [[0, 0, 0.039]], [[0, 0, 0.041]])  # the width is 2: 2 % are 0.04
     found = window_metrics(grid + half, grid, 50.0)
     assert found["precision_2pct"] == found["recall_2pct"] == found["near_2pct"] == found["fscore_2pct"] == 0.5
@@ -61,18 +67,18 @@ def perfect_maps(batch: dict[str, torch.Tensor]) -> torch.Tensor:
 
 def test_matching_accuracy_is_one_for_perfect_maps_and_small_for_noise() -> None:
     batch = make_batch(2)
-    right, visible = matching_counts(perfect_maps(batch), batch, 64)
+    right, visible = matching_counts({"match_map": perfect_maps(batch)}, batch, 64)
     assert visible > 20
     assert right / visible > 0.98
     noise = F.normalize(torch.randn(2, 3, 16, 16, 32, generator=torch.Generator().manual_seed(0)), dim=2)
-    right, visible = matching_counts(noise, batch, 64)
+    right, visible = matching_counts({"match_map": noise}, batch, 64)
     assert right / visible < 0.1
 
 
 def test_only_visible_key_points_count() -> None:
     batch = make_batch(1, frames=2)
     batch["depth"][:, 1] = 0
-    assert matching_counts(perfect_maps(make_batch(1, frames=2)), batch, 64) == (0, 0)
+    assert matching_counts({"match_map": perfect_maps(make_batch(1, frames=2))}, batch, 64) == (0, 0)
 
 
 def test_a_repeated_frame_does_not_count_as_its_own_partner() -> None:
@@ -80,7 +86,7 @@ def test_a_repeated_frame_does_not_count_as_its_own_partner() -> None:
     for key in ("images", "depth", "intrinsics", "camera_from_window"):
         batch[key][:, 1] = batch[key][:, 0]
     assert repeated(batch).all()
-    assert matching_counts(perfect_maps(batch), batch, 64)[1] == 0
+    assert matching_counts({"match_map": perfect_maps(batch)}, batch, 64)[1] == 0
     assert not overlapping(batch)[0].any()
 
 

@@ -7,15 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import shapely
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch.utils.data import Dataset, Sampler
 
-from overfly.data.footprints import choose_frames
+from overfly.data.footprints import choose_frames, footprint
 from overfly.data.record import Record, read_record
-from overfly.data.windows import to_window, to_world, window_sample
+from overfly.data.windows import camera_from_window, height_range, to_window, window_sample
 from overfly.errors import InputError
+from overfly.flights.footprint import polygons
+from overfly.geometry import Array, Camera
 
 Index = tuple[int, int]
 """(epoch, index of the window)."""
@@ -31,6 +34,10 @@ class WindowSettings:
     ground_sigma_m: float
     position_sigma_m: float
     rotation_sigma_deg: float
+    drop_share: float
+    light_sigma: float
+    camera_sigma_px: float
+    shrink: int
 
     def __post_init__(self) -> None:
         if self.choice not in ("overlap", "consecutive"):
@@ -65,20 +72,33 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
         number, chosen = self.windows[index]
         record, settings = self.records[number], self.settings
         rng = np.random.default_rng([self.seed, epoch if self.augment else 0, index])
-        poses = np.asarray(record.world_from_camera[chosen])
         ground = record.ground_height + rng.normal(0, settings.ground_sigma_m)
+        heights = None
+        if self.augment:
+            chosen = [chosen[0], *(chosen[0] if rng.random() < settings.drop_share else i for i in chosen[1:])]
+            low, high = height_range(float(record.world_from_camera[chosen[0], 2, 3] - ground))
+            heights = (low * rng.uniform(0.8, 1.3), high * rng.uniform(0.8, 1.3))
+        poses, images, cameras, depth = self._frames(record, chosen)
         sample, world_from_window = window_sample(
-            [np.asarray(record.images[i]) for i in chosen],
-            [record.cameras[i] for i in chosen],
+            images,
+            cameras,
             poses,
             ground,
-            prior_world_from_camera=_disturb(poses, settings, rng),
+            prior_world_from_camera=disturbed(poses, settings.position_sigma_m, settings.rotation_sigma_deg, rng),
+            heights=heights,
         )
         scale = float(sample["scale"])
-        sample["depth"] = np.asarray(record.depth[chosen], np.float32) / np.float32(scale)
-        sample["reference"] = reference_points(record, world_from_window, scale, settings.points, rng)
-        if self.twice:
-            sample["reference_again"] = reference_points(record, world_from_window, scale, settings.points, rng)
+        if self.augment:
+            sample["images"] = relit(sample["images"], settings.light_sigma, rng)
+            turns = np.degrees(settings.camera_sigma_px / cameras[0].fx)
+            shaken = disturbed(poses, 0.0, turns, rng)
+            shaken[0] = poses[0]  # depth belongs to the reference frame
+            shaken[[i == chosen[0] for i in chosen]] = poses[0]
+            sample["camera_from_window"] = camera_from_window(shaken, world_from_window, scale).astype(np.float32)
+        sample["depth"] = depth / np.float32(scale)
+        area = footprint(cameras[0], poses[0], ground)
+        for name in ("reference", "reference_again") if self.twice else ("reference",):
+            sample[name] = reference_points(record, area, world_from_window, scale, settings.points, rng)
         tensors = {name: torch.from_numpy(np.array(value)) for name, value in sample.items()}
         for name, value in (
             ("scene", int(record.facts["scene"])),
@@ -87,6 +107,17 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
         ):
             tensors[name] = torch.tensor(value)
         return tensors
+
+    def _frames(self, record: Record, chosen: list[int]) -> tuple[Array, list[NDArray], list[Camera], NDArray]:
+        """Poses, images, cameras and depth of frames; images are means over ``shrink`` x ``shrink`` pixels."""
+        poses, n = np.asarray(record.world_from_camera[chosen]), self.settings.shrink
+        images, cameras = [np.asarray(record.images[i]) for i in chosen], [record.cameras[i] for i in chosen]
+        depth = np.asarray(record.depth[chosen], np.float32)
+        if n == 1:
+            return poses, images, cameras, depth
+        height, width = images[0].shape[0] // n, images[0].shape[1] // n
+        blocks = [image.reshape(height, n, width, n, 3).mean((1, 3)).round().astype(np.uint8) for image in images]
+        return poses, blocks, [c.resized(width, height) for c in cameras], depth[:, n // 2 :: n, n // 2 :: n]
 
 
 def _windows(record: Record, settings: WindowSettings) -> list[list[int]]:
@@ -105,40 +136,47 @@ def _windows(record: Record, settings: WindowSettings) -> list[list[int]]:
 
 
 def reference_points(
-    record: Record, world_from_window: NDArray, scale: float, count: int, rng: np.random.Generator
+    record: Record, area: NDArray, world_from_window: NDArray, scale: float, count: int, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Points [count, 3] in window units, uniform in x, y over [-1, 1]^2 on the top surface.
+    """Points [count, 3] in window units, uniform in world x, y over an area [4, 2] on the top surface.
 
-    Where the reference covers only a part of the square, all points lie on that part.
+    Where the reference covers only a part of the area, all points lie on that part.
 
     Raises:
-        InputError: the reference covers less than a tenth of the square.
+        InputError: the reference covers less than a tenth of the area.
     """
+    shape, low, high = polygons(area[None])[0], area.min(0), area.max(0)
     kept: list[NDArray] = []
-    for attempt in range(20):
-        square = np.concatenate([rng.uniform(-1, 1, (count, 2)), np.zeros((count, 1))], axis=1)
-        world = to_world(square, world_from_window, scale)
-        world[:, 2] = record.surface(world[:, :2])
-        kept.append(world[np.isfinite(world[:, 2])])
-        found = sum(map(len, kept))
-        if found >= count:
-            points = to_window(np.concatenate(kept)[:count], world_from_window, scale)
-            return points.astype(np.float32)
-        if attempt == 9 and found < count:
-            break
-    raise InputError(
-        "The reference covers less than a tenth of a window's ground: give a reference cloud of the whole flight, "
-        "or leave out the frames beyond it."
-    )
+    drawn = found = 0
+    while found < count:
+        world = rng.uniform(low, high, (2 * count, 2))
+        world = world[shapely.contains_xy(shape, world[:, 0], world[:, 1])]
+        drawn += len(world)
+        kept.append(np.column_stack([world, record.surface(world)]))
+        kept[-1] = kept[-1][np.isfinite(kept[-1][:, 2])]
+        found += len(kept[-1])
+        if drawn > 10 * count and found < 0.1 * drawn:
+            raise InputError(
+                "The reference covers less than a tenth of a window's ground: give a reference cloud of the whole "
+                "flight, or leave out the frames beyond it."
+            )
+    return to_window(np.concatenate(kept)[:count], world_from_window, scale).astype(np.float32)
 
 
-def _disturb(poses: NDArray, settings: WindowSettings, rng: np.random.Generator) -> NDArray:
-    """Poses as GPS and gimbal would tell them: independent normal errors for each frame."""
+def disturbed(poses: NDArray, position_sigma_m: float, rotation_sigma_deg: float, rng: np.random.Generator) -> NDArray:
+    """Poses [n, 4, 4] with independent normal errors for each frame and axis, as GPS and gimbal would tell them."""
     noisy = poses.copy()
-    turns = Rotation.from_rotvec(np.radians(rng.normal(0, settings.rotation_sigma_deg, (len(poses), 3)))).as_matrix()
+    turns = Rotation.from_rotvec(np.radians(rng.normal(0, rotation_sigma_deg, (len(poses), 3)))).as_matrix()
     noisy[:, :3, :3] = noisy[:, :3, :3] @ turns
-    noisy[:, :3, 3] += rng.normal(0, settings.position_sigma_m, (len(poses), 3))
+    noisy[:, :3, 3] += rng.normal(0, position_sigma_m, (len(poses), 3))
     return noisy
+
+
+def relit(images: NDArray[np.float32], sigma: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Images [K, 3, H, W] in 0..1, each under another exposure, white balance and contrast."""
+    gain = np.exp(rng.normal(0, sigma, (len(images), 1, 1, 1)) + rng.normal(0, sigma / 3, (len(images), 3, 1, 1)))
+    gamma = np.exp(rng.normal(0, sigma, (len(images), 1, 1, 1)))
+    return np.clip(gain * np.maximum(images, 1e-4) ** gamma, 0, 1).astype(np.float32)
 
 
 class WindowSampler(Sampler[Index]):

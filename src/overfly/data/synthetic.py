@@ -62,7 +62,8 @@ class SyntheticFlights:
     """Records of flights over procedural scenes; every value comes from conf/data/synthetic.yaml.
 
     ``train``, ``val`` and ``test`` fly over different scenes of the same styles, ``unseen`` over other styles. Flights
-    take turns over styles and cells; each holds ``images_per_flight`` frames, the last of a cell what is left.
+    take turns over styles and cells (altitude, overlap, path); each holds ``images_per_flight`` frames, the last of a
+    cell what is left.
 
     Raises:
         InputError: a style, path or camera is unknown, or a count is not possible.
@@ -75,11 +76,12 @@ class SyntheticFlights:
         unseen_styles: Sequence[str],
         images: dict[str, int],
         images_per_flight: int,
-        cells: Sequence[dict[str, float]] | None,
+        cells: Sequence[dict[str, Any]] | None,
         altitude: float | Sequence[float],
         overlap: float | Sequence[float],
         side_overlap: float | None,
         flight_path: dict[str, Any],
+        flight_paths: Sequence[str] | None,
         camera: str,
         image_size: Sequence[int],
         supersample: int,
@@ -90,8 +92,10 @@ class SyntheticFlights:
         for style in [*styles, *unseen_styles]:
             if style not in STYLES:
                 raise unknown("The style", style, STYLES)
-        if flight_path["name"] not in PATHS:
-            raise unknown("The flight path", flight_path["name"], PATHS)
+        paths = [{"name": name} for name in flight_paths] if flight_paths else [dict(flight_path)]
+        for path in paths:
+            if path["name"] not in PATHS:
+                raise unknown("The flight path", path["name"], PATHS)
         if camera not in CAMERAS:
             raise unknown("The camera", camera, CAMERAS)
         if images_per_flight < 2:
@@ -100,14 +104,15 @@ class SyntheticFlights:
             raise InputError(f"images names {sorted(unsplit)}, but the splits are {', '.join(SPLITS)}.")
         if cells is None:
             cells = [
-                {"altitude": a, "overlap": o, "share": 1.0} for a, o in product(_listed(altitude), _listed(overlap))
+                {"altitude": a, "overlap": o, "share": 1.0, "flight_path": path}
+                for a, o, path in product(_listed(altitude), _listed(overlap), paths)
             ]
         self.styles = {split: list(unseen_styles if split == "unseen" else styles) for split in SPLITS}
         self.images = {split: int(images.get(split, 0)) for split in SPLITS}
         self.images_per_flight = images_per_flight
         self.cells = list(cells)
         self.side_overlap = side_overlap
-        self.flight_path = dict(flight_path)
+        self.flight_path = paths[0]
         self.camera = camera
         self.image_size = (int(image_size[0]), int(image_size[1]))
         self.supersample = supersample
@@ -124,7 +129,9 @@ class SyntheticFlights:
         wanted = np.floor(np.cumsum(shares) / shares.sum() * self.images[split] + 1e-6).astype(int)
         left = np.diff(wanted, prepend=0)
         jobs: list[FlightJob] = []
+        turn = -1
         while left.any():
+            turn += 1
             for number, cell in enumerate(self.cells):
                 if left[number] <= 0:
                     continue
@@ -136,13 +143,14 @@ class SyntheticFlights:
                 side = cell["overlap"] if self.side_overlap is None else self.side_overlap
                 jobs.append(
                     FlightJob(
-                        style=self.styles[split][len(jobs) % len(self.styles[split])],
+                        # Shifted by one every turn, or a cell would see one style only.
+                        style=self.styles[split][(number + turn) % len(self.styles[split])],
                         seed=self.seed * 1_000_003 + scene,
                         scene=scene,
                         altitude=float(cell["altitude"]),
                         overlap=float(cell["overlap"]),
                         side_overlap=float(side),
-                        flight_path=self.flight_path,
+                        flight_path=cell.get("flight_path", self.flight_path),
                         camera=self.camera,
                         image_size=self.image_size,
                         images=images,

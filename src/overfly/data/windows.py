@@ -132,6 +132,14 @@ def resample(image: NDArray, camera: Camera, pinhole: Camera) -> NDArray:
     return cv2.remap(image, mapped[..., 0], mapped[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
+def height_range(altitude: float) -> tuple[float, float]:
+    """The heights over the prior ground that are looked at, metres: known from the altitude alone.
+
+    Low flights see single buildings; from high up more relief fits into the picture.
+    """
+    return -(15 + 0.08 * altitude), 40 + 0.12 * altitude
+
+
 def window_sample(
     images: Sequence[NDArray[np.uint8]],
     cameras: Sequence[Camera],
@@ -139,6 +147,7 @@ def window_sample(
     ground_height: float,
     *,
     prior_world_from_camera: ArrayLike | None = None,
+    heights: tuple[float, float] | None = None,
 ) -> tuple[dict[str, NDArray], Array]:
     """One window as the networks take it, without its reference.
 
@@ -148,10 +157,12 @@ def window_sample(
         world_from_camera: [K, 4, 4], the cameras to go by.
         ground_height: metres, prior height of the ground.
         prior_world_from_camera: [K, 4, 4] poses from GPS and gimbal; None says that there are no others.
+        heights: lowest and highest height over the prior ground, metres; None: :func:`height_range` of the altitude.
 
     Returns:
         The sample, float32: images [K, 3, H, W] in 0..1, intrinsics [K, 3, 3], camera_from_window and
-        prior_from_window [K, 4, 4] (window units), overlaps [K, K], scale, gsd and altitude [] in metres;
+        prior_from_window [K, 4, 4] (window units), overlaps [K, K], height_range [2] (window units), scale, gsd and
+        altitude [] in metres;
         and ``world_from_window`` [4, 4] float64, which puts points back into the world (:func:`to_world`).
     """
     poses = np.asarray(world_from_camera, float)
@@ -169,5 +180,6 @@ def window_sample(
         "scale": np.array(scale),
         "gsd": np.array(np.linalg.norm(poses[0, :3, 3] - middle) / cameras[0].fx),
         "altitude": np.array(altitude),
+        "height_range": np.array(height_range(altitude) if heights is None else heights) / scale,
     }
     return {name: value.astype(np.float32) for name, value in sample.items()}, world_from_window

@@ -1,5 +1,6 @@
 """Networks: plain modules without training code (see :mod:`overfly.stages`)."""
 
 from overfly.networks.gan_decoder import GanDecoder
+from overfly.networks.sweep_decoder import SweepDecoder
 
-__all__ = ["GanDecoder"]
+__all__ = ["GanDecoder", "SweepDecoder"]

@@ -17,38 +17,35 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from overfly.errors import InputError
-from overfly.networks.blocks import initial_cloud
+from overfly.networks.ground import initial_cloud
 
 
-def flat_ground(windows: int, points: int) -> Tensor:
-    """The initial cloud for every window: [windows, points, 3], window units."""
-    return initial_cloud(points).expand(windows, -1, -1)
-
-
-def mean_cloud(references: Iterable[Tensor], points: int) -> Tensor:
-    """The initial cloud at the mean height of training references.
+def mean_heights(windows: Iterable[Mapping[str, Tensor]], points: int) -> Tensor:
+    """The mean height of each point of the initial cloud over training windows.
 
     Args:
-        references: batches [B, N, 3], window units.
+        windows: batches with ``reference`` [B, N, 3] and what :func:`initial_cloud` takes.
         points: number of points of the initial cloud.
 
     Returns:
-        [points, 3]: each point has the mean, over the windows, of the height of the reference point nearest in x, y.
+        [points]: the mean, over the windows, of the height of the reference point nearest in x, y.
 
     Raises:
         InputError: there is no window.
     """
-    cloud = initial_cloud(points)
-    grid = cloud[:, :2].double().numpy()
     total, count = np.zeros(points), 0
-    for batch in references:
-        for reference in batch.double().numpy():
-            total += heights_at(grid, reference)
+    for batch in windows:
+        for grid, reference in zip(initial_cloud(points, batch).double(), batch["reference"].double(), strict=True):
+            total += heights_at(grid[:, :2].cpu().numpy(), reference.cpu().numpy())
             count += 1
     if not count:
         raise InputError("The mean training cloud needs a training window: give a training split with images.")
-    cloud[:, 2] = torch.from_numpy(total / count).float()
-    return cloud
+    return torch.from_numpy(total / count).float()
+
+
+def lifted(cloud: Tensor, heights: Tensor) -> Tensor:
+    """Clouds [B, N, 3] at other heights [N] or [B, N]."""
+    return torch.cat([cloud[..., :2], heights.to(cloud).expand(cloud.shape[:2])[..., None]], -1)
 
 
 def heights_at(xy: NDArray, points: NDArray) -> NDArray[np.float64]:

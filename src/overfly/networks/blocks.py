@@ -72,15 +72,3 @@ def grid_side(points: int) -> int:
         near = max(1, side) ** 2
         raise InputError(f"points={points} is not a square number, which the initial cloud needs: take points={near}.")
     return side
-
-
-def initial_cloud(points: int) -> Tensor:
-    """The uniform initial cloud: the cell centres of a square grid on the plane z = 0 of [-1, 1]^2.
-
-    Returns:
-        [points, 3], window units; row by row from y = -1 upwards, x from -1 upwards within a row.
-    """
-    side = grid_side(points)
-    along = (torch.arange(side, dtype=torch.float32) + 0.5) * (2 / side) - 1
-    y, x = torch.meshgrid(along, along, indexing="ij")
-    return torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(points, 3)

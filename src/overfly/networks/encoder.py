@@ -20,8 +20,23 @@ STRIDE = 16
 MATCH_STRIDE = 2
 """Pixels of the image to one cell of the match map."""
 
+CONTEXT_STRIDE = 4
+"""Pixels of the image to one cell of the context map."""
+
 CORRECTION_SIZE = 0.02
 """Usual size of a correction, in radians and window units: 1 degree, or 1 m at 60 m per unit."""
+
+
+class DenseMaps(NamedTuple):
+    """What the encoder knows about the places in M images.
+
+    Attributes:
+        match_map: [M, C, H / 2, W / 2], unit vectors; cell (row, column) is centred on pixel (2 column + 1, 2 row + 1).
+        context: [M, C, H / 4, W / 4]: what a place is, with its surroundings.
+    """
+
+    match_map: Tensor
+    context: Tensor
 
 
 class Encoded(NamedTuple):
@@ -110,21 +125,30 @@ class Encoder(Part):
                 f"This network was built for images of {width} x {height} pixels, not {images.shape[-1]} x "
                 f"{images.shape[-2]}: resize the images, or set image_size."
             )
-        images = images.contiguous(memory_format=torch.channels_last)
-        x = self.stem((images - 0.5) * 4)  # about unit variance
-        maps: list[Tensor] = []
-        for down, block in zip([nn.Identity(), *self.downsampling], self.blocks, strict=True):
-            x = block(down(x))
-            maps.append(x)
+        maps = self._maps(images, 4)
         pooled = F.max_pool2d(maps[3], 2).flatten(1)
         features = self.feature_head(pooled)
-        return Encoded(self._match_map(maps), pooled, features, F.normalize(self.retrieval_head(features), dim=1))
+        dense = self._dense(maps[:3])
+        return Encoded(dense.match_map, pooled, features, F.normalize(self.retrieval_head(features), dim=1))
 
-    def _match_map(self, maps: list[Tensor]) -> Tensor:
-        fine, middle, coarse = (layer(level) for layer, level in zip(self.lateral, maps[:3], strict=True))
+    def dense(self, images: Tensor) -> DenseMaps:
+        """The dense maps alone, of M images [M, 3, H, W] in 0..1 of any size whose sides are multiples of 8."""
+        return self._dense(self._maps(images, 3))
+
+    def _maps(self, images: Tensor, blocks: int) -> list[Tensor]:
+        """The outputs of the first residual blocks."""
+        x = self.stem((images.contiguous(memory_format=torch.channels_last) - 0.5) * 4)  # about unit variance
+        maps: list[Tensor] = []
+        for down, block in zip([nn.Identity(), *self.downsampling][:blocks], self.blocks, strict=False):
+            x = block(down(x))
+            maps.append(x)
+        return maps
+
+    def _dense(self, maps: list[Tensor]) -> DenseMaps:
+        fine, middle, coarse = (layer(level) for layer, level in zip(self.lateral, maps, strict=True))
         context = self.context(F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + middle)
-        context = F.interpolate(context, scale_factor=2, mode="bilinear", align_corners=False)
-        return F.normalize(context + fine, dim=1)
+        wide = F.interpolate(context, scale_factor=2, mode="bilinear", align_corners=False)
+        return DenseMaps(F.normalize(wide + fine, dim=1), context)
 
     def correction(self, pooled: Tensor, prior_from_window: Tensor) -> Tensor:
         """The geometric correction of each frame's prior pose relative to the reference frame.

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from overfly.networks.discriminator import Discriminator
 from overfly.networks.encoder import Encoded, Encoder
 from overfly.networks.generator import Generator
+from overfly.networks.ground import initial_cloud
 
 
 class GanDecoder(nn.Module):
@@ -36,6 +37,7 @@ class GanDecoder(nn.Module):
         discriminator: Mapping[str, Any],
     ) -> None:
         super().__init__()
+        self.points = points
         self.register_buffer("image_size", torch.tensor([float(n) for n in size]), persistent=False)
         self.encoder = Encoder(size=size, features=features, **encoder)
         self.generator = Generator(points=points, features=features, **generator)
@@ -76,4 +78,7 @@ class GanDecoder(nn.Module):
         """
         output = self.encode(batch)
         cameras = batch["camera_from_window"], batch["intrinsics"]
-        return {**output, "points": self.generator(output["features"], *cameras, self.image_size)}
+        return {
+            **output,
+            "points": self.generator(initial_cloud(self.points, batch), output["features"], *cameras, self.image_size),
+        }

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from overfly.errors import InputError
-from overfly.networks.blocks import Part, ResidualBlock, UpsamplingBlock, grid_side, initial_cloud
+from overfly.networks.blocks import Part, ResidualBlock, UpsamplingBlock, grid_side
 from overfly.networks.encoder import Encoder
 
 POSE = 14
@@ -43,8 +43,6 @@ class Generator(Part):
         candidates: moves among which the last max-pooling chooses.
     """
 
-    initial: Tensor
-
     def __init__(
         self,
         *,
@@ -58,7 +56,6 @@ class Generator(Part):
     ) -> None:
         super().__init__()
         self.side, self.width, self.candidates = grid_side(points), width, candidates
-        self.register_buffer("initial", initial_cloud(points), persistent=False)
         self.frame_head = nn.Sequential(nn.Linear(features + POSE, features), nn.PReLU())
         self.fusion = nn.Sequential(nn.Linear(features, features), nn.PReLU())
         self.from_features = nn.Linear(features, width)
@@ -76,10 +73,13 @@ class Generator(Part):
             self.last.weight.mul_(0.1)
             self.last.bias.zero_()
 
-    def forward(self, features: Tensor, camera_from_window: Tensor, intrinsics: Tensor, image_size: Tensor) -> Tensor:
+    def forward(
+        self, initial: Tensor, features: Tensor, camera_from_window: Tensor, intrinsics: Tensor, image_size: Tensor
+    ) -> Tensor:
         """One cloud per window.
 
         Args:
+            initial: the initial cloud [B, points, 3], window units, row by row of its grid.
             features: DFVs [B, K, features].
             camera_from_window: [B, K, 4, 4].
             intrinsics: [B, K, 3, 3], pixels.
@@ -89,11 +89,11 @@ class Generator(Part):
             Points [B, points, 3], window units; point i belongs to point i of the initial cloud.
         """
         code = self.code(features, camera_from_window, intrinsics, image_size)
-        entry = self.from_features(code)[:, None] + self.from_point(self.initial)  # [B, N, C]
+        entry = self.from_features(code)[:, None] + self.from_point(initial)  # [B, N, C]
         grid = entry.unflatten(1, (self.side, self.side)).permute(0, 3, 1, 2)  # [B, C, side, side], channels last
         grid = self.upsampling(self.blocks(self.activation(grid)))
         moves = self.last(self.head(grid.permute(0, 2, 3, 1).flatten(1, 2)))  # [B, N, 3 candidates]
-        return self.initial + moves.unflatten(-1, (3, self.candidates)).amax(-1)
+        return initial + moves.unflatten(-1, (3, self.candidates)).amax(-1)
 
     def code(self, features: Tensor, camera_from_window: Tensor, intrinsics: Tensor, image_size: Tensor) -> Tensor:
         """The window's dense feature vector [B, features] from those of its frames and their cameras."""

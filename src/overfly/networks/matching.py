@@ -164,7 +164,7 @@ def true_correspondences(
     Args:
         pixels_a: [P, M, 2].
         depth_a, depth_b: [P, H, W], 0 = unknown.
-        intrinsics_a, intrinsics_b: [P, 3, 3].
+        intrinsics_a, intrinsics_b: [P, 3, 3]; any homography from camera axes to pixels.
         a_from_window, b_from_window: rigid camera poses [P, 4, 4], in the depths' unit.
         tolerance: b sees the point if its depth there is the point's own within this share.
 
@@ -175,12 +175,14 @@ def true_correspondences(
     depth, known = sample_depth(depth_a, pixels_a)
     ones = torch.ones_like(depth)[..., None]
     rays = torch.cat([pixels_a, ones], -1) @ torch.linalg.inv(intrinsics_a).transpose(1, 2)
+    rays = rays / rays[..., 2:]  # of an aligned frame, whose matrix is any homography
     b_from_a = b_from_window @ torch.linalg.inv(a_from_window)
     in_b = (rays * depth[..., None]) @ b_from_a[:, :3, :3].transpose(1, 2) + b_from_a[:, None, :3, 3]
     z = in_b[..., 2]
     ahead = known & (z > 1e-6)
     projected = in_b @ intrinsics_b.transpose(1, 2)
-    pixels_b = projected[..., :2] / torch.where(ahead, z, torch.ones_like(z))[..., None]
+    ahead = ahead & (projected[..., 2] > 1e-6)
+    pixels_b = projected[..., :2] / torch.where(ahead, projected[..., 2], torch.ones_like(z))[..., None]
     pixels_b = torch.where(ahead[..., None], pixels_b, torch.full_like(pixels_b, -1.0))
     seen, valid = sample_depth(depth_b, pixels_b)
     return pixels_b, ahead & valid & ((seen - z).abs() <= tolerance * z)

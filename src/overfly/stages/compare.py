@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from overfly.networks.baselines import NearestWindow, flat_ground, mean_cloud
+from overfly.networks.baselines import NearestWindow, lifted, mean_heights
+from overfly.networks.ground import initial_cloud
 from overfly.stages.clouds import window_emd, window_metrics
 from overfly.tables import markdown, write_rows
 
@@ -51,15 +52,15 @@ def compare(
     nearest = NearestWindow()
     for batch in train:
         nearest.add(network(batch), batch)
-    mean = mean_cloud(nearest.references, points)
+    mean = mean_heights(train, points)
     rows: list[Row] = []
     for split, batches in splits.items():
         found: dict[str, list[dict[str, float]]] = {}
         for batch in batches:
-            output, count = network(batch), len(batch["reference"])
+            output, flat = network(batch), initial_cloud(points, batch)
             answers = {
-                "flat ground": flat_ground(count, points),
-                "mean training cloud": mean.expand(count, -1, -1),
+                "flat ground": flat,
+                "mean training cloud": lifted(flat, mean),
                 "nearest training window": nearest(output),
                 name: output["points"],
             }

@@ -70,7 +70,7 @@ class EncoderStage(Stage):
 
     @torch.no_grad()
     def _accuracy(self, output: dict[str, Tensor], batch: Batch, split: str) -> None:
-        right, visible = matching_counts(output["match_map"].detach(), batch, self.keypoints)
+        right, visible = matching_counts(output, batch, self.keypoints)
         self.report(split, {"accuracy": right / max(visible, 1)}, visible)
 
     def _evaluate(self, batch: Batch, batch_idx: int, split: str) -> None:

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from overfly import losses
+from overfly.stages import surfaces
 from overfly.stages.clouds import window_emd, window_metrics
 from overfly.stages.stage import Batch, OptimizerFactory, Stage, log
+from overfly.stages.surfaces import surface_metrics, surface_terms
 
 
 class GanStage(Stage):
@@ -32,7 +34,7 @@ class GanStage(Stage):
         others: see :class:`overfly.stages.stage.Stage`.
     """
 
-    terms: ClassVar[tuple[str, ...]] = ("chamfer", "emd", "adversarial", "adversarial_eq1")
+    terms: ClassVar[tuple[str, ...]] = ("chamfer", "emd", "adversarial", "adversarial_eq1", *surfaces.TERMS)
     accuracy: ClassVar[str] = "discriminator_accuracy"
     loss: ClassVar[str] = "loss_discriminator"
 
@@ -105,6 +107,7 @@ class GanStage(Stage):
             self.optimise(players[0], loss, batch_idx, parts)
         self._report_losses("train", loss, terms, len(real))
         self._report_clouds("train", cloud, batch)
+        self._report_surfaces("train", output, batch)
         if judged is not None:
             self._report_players("train", *judged)
 
@@ -136,8 +139,10 @@ class GanStage(Stage):
                     terms[name] = getattr(losses, name)(logits)
         return terms
 
-    def _more_terms(self, output: dict[str, Tensor], batch: Batch, random: torch.Generator) -> dict[str, Tensor]:
-        return {}
+    def _more_terms(self, output: dict[str, Any], batch: Batch, random: torch.Generator) -> dict[str, Tensor]:
+        if "surfaces" not in output:
+            return {}
+        return surface_terms(output["surfaces"], batch, self.weights)
 
     def _evaluate(self, batch: Batch, batch_idx: int, split: str) -> None:
         output = self.network(batch)
@@ -146,6 +151,7 @@ class GanStage(Stage):
         terms = {**self._cloud_terms(cloud, real, random), **self._more_terms(output, batch, random)}
         self._report_losses(split, self.total(terms), terms, len(real))
         self._report_clouds(split, cloud, batch)
+        self._report_surfaces(split, output, batch)
         if self._adversarial():
             self._report_players(split, self._logits(real, random), self._logits(cloud, random))
         if batch_idx < self.emd_batches and cloud.shape[1] == real.shape[1]:
@@ -163,7 +169,9 @@ class GanStage(Stage):
         return logits
 
     def _blocks_from_encoder(self) -> str:
-        line: str = self.network.generator.start_from(self.network.encoder)  # type: ignore[union-attr, operator]
+        if not hasattr(self.network.generator, "start_from"):
+            return "generator: starts at random (seeded)"
+        line: str = self.network.generator.start_from(self.network.encoder)  # type: ignore[operator]
         return line
 
     def _report_losses(self, split: str, loss: Tensor, terms: dict[str, Tensor], count: int) -> None:
@@ -174,6 +182,10 @@ class GanStage(Stage):
         arrays = (x.detach().cpu().numpy() for x in (cloud, batch["reference"], batch["scale"]))
         rows = [window_metrics(*window) for window in zip(*arrays, strict=True)]
         self._report(split, {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]}, len(rows))
+
+    def _report_surfaces(self, split: str, output: dict[str, Any], batch: Batch) -> None:
+        if "surfaces" in output:
+            self._report(split, *surface_metrics(output, batch))
 
     def _report_players(self, split: str, on_real: Tensor, on_cloud: Tensor) -> None:
         right = ((on_real > 0).float().mean() + (on_cloud < 0).float().mean()) / 2

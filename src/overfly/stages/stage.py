@@ -20,7 +20,10 @@ log = logging.getLogger("overfly")
 Batch = dict[str, Tensor]
 OptimizerFactory = Callable[..., torch.optim.Optimizer]
 
-TERMS = ("chamfer", "emd", "adversarial", "adversarial_eq1", "correspondence", "retrieval", "correction")
+TERMS = (
+    "chamfer", "emd", "adversarial", "adversarial_eq1", "correspondence", "retrieval", "correction",
+    "height", "hypotheses", "sigma", "confidence",
+)  # fmt: skip
 """The weights of conf/loss; each is named like its function in :mod:`overfly.losses`."""
 
 TEST_SPLITS = ("test", "unseen")

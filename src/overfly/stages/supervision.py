@@ -39,7 +39,7 @@ def encoder_terms(
     """
     names, terms = set(names), {}
     if "correspondence" in names:
-        terms["correspondence"] = _correspondence(output["match_map"], batch, pixels, random)
+        terms["correspondence"] = _correspondence(output, batch, pixels, random)
     if "retrieval" in names:
         positive, negative = overlapping(batch)
         values = losses.retrieval(output["descriptor"].flatten(0, 1), positive, negative)
@@ -71,17 +71,18 @@ def repeated(batch: Mapping[str, Tensor]) -> Tensor:
     return (poses[:, :, None] - poses[:, None]).abs().amax(-1) < 1e-6
 
 
-def matching_counts(match_map: Tensor, batch: Mapping[str, Tensor], count: int) -> tuple[int, int]:
+def matching_counts(output: Mapping[str, Tensor], batch: Mapping[str, Tensor], count: int) -> tuple[int, int]:
     """Key points whose nearest neighbour in an overlapping frame is within 2 px of the truth, and all that are visible.
 
     Args:
-        match_map: [B, K, C, h, w].
+        output: of the network: ``match_map`` [B, K, C, h, w], and whose images it belongs to.
         batch: of windows.
         count: key points per frame.
 
     Returns:
         Both numbers, over all ordered pairs of frames of the windows.
     """
+    match_map, cameras = output["match_map"].detach(), match_cameras(output, batch)
     b, k, _, h, w = match_map.shape
     places = cell_pixels(h, w, MATCH_STRIDE, match_map.device)
     cells, score = (x.unflatten(0, (b, k)) for x in keypoints(match_map.flatten(0, 1), count))
@@ -93,7 +94,7 @@ def matching_counts(match_map: Tensor, batch: Mapping[str, Tensor], count: int) 
         queries = queries.gather(1, cells[:, i, :, None].expand(-1, -1, queries.shape[2]))
         for j in range(k):
             if i != j:
-                true, seen = true_correspondences(pixels, *_views(batch, i), *_views(batch, j))
+                true, seen = true_correspondences(pixels, *cameras[i], *cameras[j])
                 seen = seen & torch.isfinite(score[:, i]) & ~same[:, i, j, None]
                 found, _ = nearest(queries, match_map[:, j])
                 right += int((seen & ((found - true).norm(dim=-1) <= RIGHT_PX)).sum())
@@ -115,7 +116,10 @@ def correction_errors(output: Mapping[str, Tensor], batch: Mapping[str, Tensor])
     return errors
 
 
-def _correspondence(match_map: Tensor, batch: Mapping[str, Tensor], count: int, random: torch.Generator) -> Tensor:
+def _correspondence(
+    output: Mapping[str, Tensor], batch: Mapping[str, Tensor], count: int, random: torch.Generator
+) -> Tensor:
+    match_map, cameras = output["match_map"], match_cameras(output, batch)
     b, k, _, h, w = match_map.shape
     places = cell_pixels(h, w, MATCH_STRIDE, match_map.device).expand(b, -1, -1)
     same = repeated(batch)
@@ -123,7 +127,7 @@ def _correspondence(match_map: Tensor, batch: Mapping[str, Tensor], count: int, 
     for i in range(k):
         for j in range(i + 1, k):
             first, second = (i, j) if int(torch.randint(2, (1,), generator=random)) else (j, i)
-            true, visible = true_correspondences(places, *_views(batch, first), *_views(batch, second))
+            true, visible = true_correspondences(places, *cameras[first], *cameras[second])
             order = torch.rand(b, h * w, generator=random).to(visible.device)
             chosen = torch.where(visible, order, order - 1).topk(min(count, h * w), dim=1).indices  # visible ones first
             queries = match_map[:, first].flatten(2).transpose(1, 2)
@@ -136,8 +140,14 @@ def _correspondence(match_map: Tensor, batch: Mapping[str, Tensor], count: int, 
     return _mean(torch.stack(values), torch.stack(judged))
 
 
-def _views(batch: Mapping[str, Tensor], frame: int) -> tuple[Tensor, Tensor, Tensor]:
-    return batch["depth"][:, frame], batch["intrinsics"][:, frame], batch["camera_from_window"][:, frame]
+Cameras = tuple[Tensor, Tensor, Tensor]
+
+
+def match_cameras(output: Mapping[str, Tensor], batch: Mapping[str, Tensor]) -> list[Cameras]:
+    """Depth, intrinsics and pose of the images that each frame's match map belongs to: its own, or aligned ones."""
+    depth, intrinsics = output.get("match_depth", batch["depth"]), output.get("match_intrinsics", batch["intrinsics"])
+    poses = batch["camera_from_window"]
+    return [(depth[:, k], intrinsics[:, k], poses[:, k]) for k in range(poses.shape[1])]
 
 
 def _mean(values: Tensor, judged: Tensor) -> Tensor:
