@@ -127,9 +127,16 @@ def correction(predicted: Tensor, true: Tensor, beta: float = 0.01) -> Tensor:
     return torch.nn.functional.smooth_l1_loss(predicted, true, beta=beta, reduction="none").sum(-1)
 
 
-def height(predicted: Tensor, true: Tensor, beta: float = 0.02) -> Tensor:
-    """Smooth L1 between heights in window units, elementwise; quadratic below ``beta``, 1 % of the footprint."""
-    return torch.nn.functional.smooth_l1_loss(predicted, true, beta=beta, reduction="none")
+def height(predicted: Tensor, true: Tensor, beta: Tensor) -> Tensor:
+    """Smooth L1 between heights in window units, elementwise; quadratic below ``beta`` (Girshick 2015).
+
+    Args:
+        predicted, true: of one shape.
+        beta: above 0, broadcast against them: about half the spacing of the hypotheses, or finer sweeps would be
+            taught to be no better than coarse ones.
+    """
+    error = (predicted - true).abs()
+    return torch.where(error < beta, error.square() / (2 * beta), error - beta / 2)
 
 
 def hypotheses(logits: Tensor, heights: Tensor, true: Tensor) -> Tensor:

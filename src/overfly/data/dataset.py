@@ -99,6 +99,8 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
         area = footprint(cameras[0], poses[0], ground)
         for name in ("reference", "reference_again") if self.twice else ("reference",):
             sample[name] = reference_points(record, area, world_from_window, scale, settings.points, rng)
+        if self.augment and rng.random() < 0.5:
+            sample = mirrored(sample)
         tensors = {name: torch.from_numpy(np.array(value)) for name, value in sample.items()}
         for name, value in (
             ("scene", int(record.facts["scene"])),
@@ -177,6 +179,23 @@ def relit(images: NDArray[np.float32], sigma: float, rng: np.random.Generator) -
     gain = np.exp(rng.normal(0, sigma, (len(images), 1, 1, 1)) + rng.normal(0, sigma / 3, (len(images), 3, 1, 1)))
     gamma = np.exp(rng.normal(0, sigma, (len(images), 1, 1, 1)))
     return np.clip(gain * np.maximum(images, 1e-4) ** gamma, 0, 1).astype(np.float32)
+
+
+def mirrored(sample: dict[str, NDArray]) -> dict[str, NDArray]:
+    """The window as a mirror shows it: left and right are swapped in the world and so in every image."""
+    swapped = dict(sample)
+    width = sample["images"].shape[3]
+    for name in ("images", "depth"):
+        swapped[name] = np.ascontiguousarray(sample[name][..., ::-1])
+    swapped["intrinsics"] = sample["intrinsics"].copy()
+    swapped["intrinsics"][:, 0, 2] = width - sample["intrinsics"][:, 0, 2]
+    swap = np.array([-1, 1, 1, 1], np.float32)
+    for name in ("camera_from_window", "prior_from_window"):
+        swapped[name] = sample[name] * swap[:, None] * swap
+    for name in ("reference", "reference_again"):
+        if name in sample:
+            swapped[name] = sample[name] * swap[:3]
+    return swapped
 
 
 class WindowSampler(Sampler[Index]):

@@ -5,13 +5,14 @@ A ray's image in another frame is a straight line that is linear in the height, 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
+from overfly.errors import InputError
 from overfly.networks.ground import MARGIN, Rays
+from overfly.scenes.device import start
 
 NO_BASE = 0.02
 """Frames nearer to the reference than this share of its height see no parallax: they are the same image again."""
@@ -91,38 +92,111 @@ def agreement(
 ) -> tuple[Tensor, Tensor]:
     """Similarity between the reference's features and those that the other frames show at hypothetical heights.
 
+    Differentiable in both feature maps; the heights are taken as constants.
+
     Args:
         reference: unit features of the rays [B, C, N].
         others: unit feature maps of the aligned frames 1 to K - 1 [B, V, C, h, w].
         lines: of the rays.
         heights: [B, D, N], window units.
         stride: pixels of the aligned image to one cell of the maps.
-        groups: of channels, each with a similarity of its own.
+        groups: of channels, each with a similarity of its own; C / groups is a multiple of 4.
 
     Returns:
         Features [B, 2 groups + 1, D, N]: the groups' mean and the frames' best over the frames that see the point
         (0 without any), and the share of the window's other frames that do; and ``visible`` [B, V, D, N].
+
+    Raises:
+        InputError: the channels do not split into groups of 4, 8, 12, ...
     """
-    b, v, c, h, w = others.shape
-    d, n = heights.shape[1:]
-    if not v:
-        zeros = torch.zeros(b, 2 * groups + 1, d, n, dtype=reference.dtype, device=reference.device)
-        return zeros, torch.zeros(b, 0, d, n, dtype=torch.bool, device=reference.device)
-    at = lines.q[:, :, None] + heights[:, None, ..., None] * lines.r[:, :, None]  # [B, V, D, N, 3]
-    ahead = at[..., 2] > 1e-4
-    size = torch.tensor([w, h], dtype=at.dtype, device=at.device) * stride
-    grid = at[..., :2] / at[..., 2:].clamp(min=1e-4) / size * 2 - 1
-    visible = seen(lines, heights) & ahead & (grid.abs() < 1).all(-1)
-    grid = torch.where(visible[..., None], grid, torch.zeros_like(grid))
-    sampled = F.grid_sample(others.flatten(0, 1), grid.flatten(0, 1), align_corners=False)  # [B V, C, D, N]
-    product = sampled.unflatten(0, (b, v)) * reference[:, None, :, None]
-    likeness = product.unflatten(2, (groups, c // groups)).sum(3) * groups  # [B, V, G, D, N]
-    likeness = torch.where(visible[:, :, None], likeness, torch.zeros_like(likeness))
-    count = visible.float().sum(1, keepdim=True)  # [B, 1, D, N]
-    mean = likeness.sum(1) / count.clamp(min=1)
-    best = torch.where(visible[:, :, None], likeness, torch.full_like(likeness, -2.0)).amax(1)
-    best = torch.where(count > 0, best, torch.zeros_like(best))
-    return torch.cat([mean, best, count / v], 1), visible
+    channels = reference.shape[1]
+    if channels % (4 * groups):
+        raise InputError(f"{channels} match channels do not split into {groups} groups of 4, 8, 12, ... channels.")
+    if not others.shape[1]:
+        volume = reference.new_zeros(len(reference), 2 * groups + 1, *heights.shape[1:])
+        return volume, torch.zeros(len(reference), 0, *heights.shape[1:], dtype=torch.bool, device=reference.device)
+    volume, visible = _Agreement.apply(
+        reference.transpose(1, 2).contiguous(),
+        others.permute(0, 1, 3, 4, 2).flatten(2, 3).contiguous(),
+        lines,
+        heights.detach().contiguous(),
+        tuple(others.shape[-2:]),
+        stride,
+        groups,
+    )
+    return volume, visible.bool()
+
+
+class _Agreement(torch.autograd.Function):
+    """The kernels of :mod:`overfly.networks.sweep_kernels` as an operation of torch."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, reference: Tensor, maps: Tensor, lines: Lines, heights: Tensor, size: tuple[int, int],
+        stride: int, groups: int,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        from overfly.networks.sweep_kernels import compare
+
+        (b, d, n), v, device = heights.shape, maps.shape[1], maps.device
+        volume = torch.zeros(b, 2 * groups + 1, d, n, device=device)
+        best = torch.zeros(b, groups, d, n, dtype=torch.int8, device=device)
+        visible = torch.zeros(b, v, d, n, dtype=torch.uint8, device=device)
+        sweep = _sweep(reference, maps, lines, heights, size, stride, groups)
+        _launch(compare, (b, n), device, [sweep, *(_warp(x) for x in (volume, best, visible))])
+        ctx.save_for_backward(reference, maps, heights, best, visible)
+        ctx.lines, ctx.size, ctx.stride, ctx.groups = lines, size, stride, groups
+        ctx.mark_non_differentiable(visible)
+        return volume, visible
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        from overfly.networks.sweep_kernels import compare_backward
+
+        reference, maps, heights, best, visible = ctx.saved_tensors
+        to_reference, to_maps = torch.zeros_like(reference), torch.zeros_like(maps)
+        sweep = _sweep(reference, maps, ctx.lines, heights, ctx.size, ctx.stride, ctx.groups)
+        given = [_warp(x) for x in (best, visible, gradients[0].contiguous())]
+        found = [_warp(_quads(x), "vec4") for x in (to_reference, to_maps.flatten(0, 1))]
+        _launch(compare_backward, (len(heights), heights.shape[2]), maps.device, [sweep, *given, *found])
+        return to_reference, to_maps, None, None, None, None, None
+
+
+def _quads(x: Tensor) -> Tensor:
+    """Channels in fours: [..., C] -> [..., C / 4, 4]."""
+    return x.unflatten(-1, (-1, 4))
+
+
+def _warp(x: Tensor, kind: str | None = None) -> Any:
+    """A tensor as an array of warp, without a copy; ``kind``: "vec3", "vec4" for its last dimension."""
+    import warp as wp
+
+    return wp.from_torch(x, dtype=getattr(wp, kind) if kind else None, requires_grad=False)
+
+
+def _sweep(
+    reference: Tensor, maps: Tensor, lines: Lines, heights: Tensor, size: tuple[int, int], stride: int, groups: int
+) -> Any:
+    start()
+    from overfly.networks.sweep_kernels import Sweep
+
+    sweep = Sweep()
+    for name in ("q", "r", "own_q", "own_r"):
+        setattr(sweep, name, _warp(getattr(lines, name).detach().flatten(0, 1).contiguous(), "vec3"))
+    sweep.apart = _warp(lines.apart.to(torch.uint8).flatten())
+    sweep.heights = _warp(heights)
+    sweep.reference, sweep.maps = _warp(_quads(reference.detach()), "vec4"), _warp(_quads(maps.detach().flatten(0, 1)), "vec4")
+    sweep.views, sweep.groups = maps.shape[1], groups
+    sweep.height, sweep.width = size
+    sweep.stride = float(stride)
+    sweep.own_width, sweep.own_height = (float(x) for x in lines.size)
+    return sweep
+
+
+def _launch(kernel: Any, dim: tuple[int, int], device: torch.device, inputs: list[Any]) -> None:
+    import warp as wp
+
+    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    wp.launch(kernel, dim=dim, inputs=inputs, device=wp.device_from_torch(device), stream=stream)
 
 
 def canvas_to_reference(maps: Tensor, stride: int, size: tuple[int, int]) -> Tensor:

@@ -46,7 +46,8 @@ def surface_terms(surfaces: Sequence[Surface], batch: Mapping[str, Tensor], name
         true, known = true_heights(batch, surface.height.shape[2], surface.height.shape[1])
         error = (surface.height - true).detach()
         if "height" in names:
-            found.setdefault("height", []).append(_mean(losses.height(surface.height, true), known))
+            half_step = surface.step[:, None, None] / 2
+            found.setdefault("height", []).append(_mean(losses.height(surface.height, true, half_step), known))
         if "sigma" in names:
             scaled = error / surface.step[:, None, None]
             found.setdefault("sigma", []).append(_mean(losses.sigma(surface.log_sigma.clamp(-6, 6), scaled), known))
