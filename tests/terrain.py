@@ -124,3 +124,19 @@ def make_sweep_network(**changes):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return SweepDecoder(**{"size": [64, 32], "points": 256, "features": 32, **parts, **changes})
+
+
+def make_local_network(**changes):
+    """A tiny LocalDecoder for images of 64 x 32 pixels, with the same random weights every time."""
+    from overfly.networks import LocalDecoder
+
+    parts = {
+        "encoder": {"widths": [4, 8, 8, 16], "descriptor": 16, "match_channels": 8, "correction_width": 16},
+        "generator": {"width": 16, "layers": 2},
+        "discriminator": {"widths": [8, 16], "strides": [1, 4], "head_width": 8},
+    }
+    for name in parts:
+        parts[name] |= changes.pop(name, {})
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return LocalDecoder(**{"size": [64, 32], "points": 256, "features": 32, **parts, **changes})
