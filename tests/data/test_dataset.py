@@ -9,11 +9,12 @@ import pytest
 import torch
 from plane import CAMERA, make_record, surface
 
-from overfly.data.dataset import WindowDataset, WindowSampler, WindowSettings, reference_points
+from overfly.data.dataset import WindowDataset, WindowSampler, WindowSettings, mirrored, reference_points
 from overfly.data.footprints import footprint
 from overfly.data.record import write_record
 from overfly.data.windows import to_world, window_frame
 from overfly.errors import InputError
+from terrain import make_batch
 
 EXACT = WindowSettings(
     frames=3,
@@ -130,3 +131,20 @@ def test_the_sampler_covers_every_window_once_in_an_order_of_its_own(world: int)
     samplers[0].set_epoch(1)
     assert list(samplers[0]) != drawn[0]
     assert all(epoch == 1 for epoch, _ in samplers[0])
+
+
+def test_a_mirrored_window_is_one_that_could_have_been_flown() -> None:
+    batch = {name: value.numpy() for name, value in make_batch(1, frames=3).items()}
+    sample = {name: batch[name][0] for name in ("images", "depth", "intrinsics", "camera_from_window")}
+    sample["prior_from_window"], sample["reference"] = sample["camera_from_window"], batch["reference"][0]
+    swapped = mirrored(sample)
+    assert np.linalg.det(swapped["camera_from_window"][1, :3, :3]) == pytest.approx(1, abs=1e-5)
+    point = np.array([*swapped["reference"][5], 1.0])
+    for k in range(3):
+        pixels = []
+        for given, x in ((sample, point * [-1, 1, 1, 1]), (swapped, point)):
+            local = given["intrinsics"][k] @ (given["camera_from_window"][k] @ x)[:3]
+            pixels.append(local[:2] / local[2])
+        width = sample["images"].shape[3]
+        assert pixels[1] == pytest.approx([width - pixels[0][0], pixels[0][1]], abs=1e-3)
+    np.testing.assert_array_equal(mirrored(swapped)["images"], sample["images"])

@@ -23,6 +23,9 @@ GATE = 3.0
 WORST_SCORE = {True: 0.2, False: 0.45}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
 
+WIDEST = 2.0
+"""Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
+
 ISLAND = 40
 """Connected pieces of depth with fewer pixels are speckle."""
 
@@ -78,7 +81,8 @@ def fuse(
     assert cloud.confidence is not None
     cloud = cloud[np.argsort(-cloud.confidence, kind="stable")]
     cloud = cloud[voxel_thin(cloud.points, size)]
-    return cloud[_accompanied(cloud.points, 4 * size)]
+    cloud = cloud[_accompanied(cloud.points, 4 * size)]
+    return cloud[_first_hand(cloud, 3 * size)]
 
 
 def _cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
@@ -95,8 +99,26 @@ def _cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     steps = np.clip(np.where(known, (1 / np.where(known, depth, middle) - 1 / middle) / unit, -30000), -30000, 30000)
     labels = steps.astype(np.int16)
     cv2.filterSpeckles(labels, -30000, ISLAND, 8)
-    depth = np.where(known & (labels > -30000), depth, np.float32(np.nan))
-    return {**data, "depth": depth}
+    known &= labels > -30000
+    depth = np.where(known, depth, np.float32(np.nan))
+    opinion = depth_map.opinion()
+    if opinion is None:
+        return {**data, "depth": depth}
+    size = depth.shape[::-1]
+    said, sigma, sure = (
+        cv2.resize(part, size, interpolation=cv2.INTER_LINEAR)
+        for part in (opinion.depth, opinion.sigma, opinion.confidence)
+    )
+    # Where nothing could be measured, the network's word stands.
+    guessed = ~known & np.isfinite(said)
+    return {
+        **data,
+        "depth": np.where(guessed, said, depth),
+        "sigma": np.where(guessed, sigma, data["sigma"]),
+        "support": np.where(guessed, 0, data["support"]).astype(np.uint8),
+        "guessed": guessed,
+        "sure": sure,
+    }
 
 
 def _points(
@@ -111,6 +133,8 @@ def _points(
     """The points of one map that earlier maps have not given, which pixels are given now, and metres per pixel."""
     depth: Map = data["depth"]
     sigma = data["sigma"]
+    guessed = data.get("guessed", np.zeros(depth.shape, bool))
+    widest = WIDEST * depth / own.camera.fx
     weight = 1 / sigma**2
     total, mean = weight.copy(), weight * depth
     agree, deny, seen = (np.zeros(depth.shape, np.uint8) for _ in range(3))
@@ -118,7 +142,7 @@ def _points(
     for j, other in partners.items():
         found, spread, given, inside = _look_up(own, depth, depth_maps[j], other, used.get(j))
         with np.errstate(invalid="ignore"):
-            gate = GATE * np.hypot(sigma, spread)
+            gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
             same = np.abs(found - depth) < gate
             # The other frame looks through this point at something behind it.
             deny += found - depth > gate
@@ -131,6 +155,8 @@ def _points(
     # One pair alone must at least agree with itself, seen from its other frame.
     votes = np.maximum(agree, data["support"])
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
+    alone = guessed & (agree == 0)  # predicted: no other frame has measured or guessed the same
+    known |= alone
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
     rows, columns = np.nonzero(fresh)
@@ -141,10 +167,14 @@ def _points(
     cloud = Cloud(
         points,
         image[rows, columns],
-        confidence=_confidence(votes, agree[fresh], data["score"][fresh]),
+        confidence=np.where(
+            guessed[fresh],
+            data["sure"][fresh] if "sure" in data else 0,
+            _confidence(votes, agree[fresh], data["score"][fresh]),
+        ).astype(np.float32),
         sigma_m=spread.astype(np.float32),
         views=(1 + votes).astype(np.uint8),
-        predicted=np.zeros(len(points), bool),
+        predicted=alone[fresh],
     )
     gsd = float(np.median(merged)) / own.camera.fx if len(merged) else float("nan")
     return cloud, known, gsd
@@ -197,6 +227,14 @@ def _confidence(votes: NDArray, agree: NDArray, score: NDArray) -> NDArray[np.fl
     """0..1 from the number of confirming pairs and maps and the correlation."""
     base = np.select([(votes <= 1) & (agree == 0), agree == 0, agree == 1], [0.45, 0.7, 0.85], 0.95)
     return (base * np.clip(0.4 + 0.7 * score, 0, 1)).astype(np.float32)
+
+
+def _first_hand(cloud: Cloud, size: float) -> NDArray[np.bool_]:
+    """Points that are measured, and predicted ones in whose cell of the plan nothing is measured."""
+    assert cloud.predicted is not None
+    cells = np.floor((cloud.points[:, :2] - cloud.points[:, :2].min(0)) / size).astype(np.int64)
+    plan = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    return ~cloud.predicted | ~np.isin(plan, plan[~cloud.predicted])
 
 
 def _accompanied(points: NDArray, size: float) -> NDArray[np.bool_]:

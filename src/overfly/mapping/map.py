@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
     network = None if asked.network is None else _network_key(asked)
     key = key_of(key, asked.dense, network if asked.dense == "sweep" else None, asked.seed)
     make: Callable[[Path], Cloud] = {
-        "sweep": lambda _: sweep_cloud(block, flight, asked, steps),
+        "sweep": lambda scratch: sweep_cloud(block, flight, scratch, asked, steps),
         "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
     }[asked.dense]
     local = steps.kept("dense", key, make, keep_cloud, kept_cloud)
@@ -101,20 +102,19 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
 
 def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:
     """The dense cloud by semi-global matching, in the block's frame."""
-    from overfly.mapping.fuse import fuse
-    from overfly.mapping.stereo import stereo
-
-    with steps.bar("dense", "depth maps") as update:
-        maps = stereo(block.frames, workdir=scratch, points=block.points, seed=asked.seed, progress=update)
-    with steps.bar("dense", "fused") as update:
-        return fuse(maps, block.frames, progress=update)
+    return _fused(block, scratch, asked, steps, None)
 
 
-def sweep_cloud(block: Block, flight: Flight, asked: MapSettings, steps: Steps) -> Cloud:
+def sweep_cloud(block: Block, flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:
     """The dense cloud by the trained network, in the block's frame."""
+    run = asked.network
+    assert run is not None
+    if getattr(run.network, "predicts_surfaces", False):
+        from overfly.mapping.sweep import SweepOpinions
+
+        return _fused(block, scratch, asked, steps, partial(SweepOpinions, run, metric=block.metric))
     from overfly.mapping.network import network_cloud, prior_pose
 
-    assert asked.network is not None
     told = block.gps_positions()
     priors = []
     for frame, pose in zip(block.frames, block.poses, strict=True):
@@ -122,14 +122,21 @@ def sweep_cloud(block: Block, flight: Flight, asked: MapSettings, steps: Steps) 
         if position is not None and np.isnan(position[2]):
             position = np.array([position[0], position[1], pose[2, 3]])
         priors.append(prior_pose(position, frame.gimbal, pose))
+    ground = ground_height(block, flight, asked.seed)
     with steps.bar("dense", "windows") as update:
-        return network_cloud(
-            block.frames,
-            asked.network,
-            ground_height=ground_height(block, flight, asked.seed),
-            priors=priors,
-            progress=update,
+        return network_cloud(block.frames, run, ground_height=ground, priors=priors, progress=update)
+
+
+def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinions: Any) -> Cloud:
+    from overfly.mapping.fuse import fuse
+    from overfly.mapping.stereo import stereo
+
+    with steps.bar("dense", "depth maps") as update:
+        maps = stereo(
+            block.frames, workdir=scratch, points=block.points, seed=asked.seed, opinions=opinions, progress=update
         )
+    with steps.bar("dense", "fused") as update:
+        return fuse(maps, block.frames, progress=update)
 
 
 def ground_height(block: Block, flight: Flight, seed: int) -> float:

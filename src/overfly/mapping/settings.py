@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from overfly.errors import InputError, unknown
-from overfly.mapping.network import TrainedRun
+from overfly.mapping.sweep import TrainedRun
 
 CAMERAS = ("auto", "given", "estimate")
 DENSE = ("sweep", "stereo")

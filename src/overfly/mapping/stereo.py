@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from overfly.data.windows import resample
 from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, project
@@ -26,6 +27,7 @@ from overfly.mapping.neighbours import choose_partners
 from overfly.mapping.rectify import Rectified, ordered, rectify
 from overfly.mapping.subpixel import Shot, refine
 
+Opinions = Callable[[int, list[int]], "Opinion | None"]
 Progress = Callable[[int, int], None]
 Map = NDArray[np.float32]
 
@@ -38,6 +40,23 @@ REFINED_SIGMA = 0.25
 
 
 @dataclass(frozen=True)
+class Opinion:
+    """What a network says of a frame before any pixel is matched: maps [h, w] over its undistorted image.
+
+    Attributes:
+        depth: metres, NaN where it knows nothing.
+        sigma: metres, 68 % of the errors are below it.
+        confidence: 0..1, the probability that the depth is right.
+        views: frames that have the place inside, this one included.
+    """
+
+    depth: Map
+    sigma: Map
+    confidence: Map
+    views: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
 class DepthMap:
     """Depth of one frame, kept in a file.
 
@@ -47,7 +66,8 @@ class DepthMap:
         world_from_camera: [4, 4].
         partners: names of the frames it was compared with.
         path: .npz with depth [H, W] in metres (NaN where unknown), sigma [H, W] in metres, support [H, W], the number
-            of pairs that agree, and score [H, W], the correlation with its best partners (-1..1).
+            of pairs that agree, and score [H, W], the correlation with its best partners (-1..1); with a network,
+            its own ``opinion`` [h, w] too.
     """
 
     name: str
@@ -65,6 +85,13 @@ class DepthMap:
                 "score": data["score"].astype(np.float32) / 100,
             }
 
+    def opinion(self) -> Opinion | None:
+        """What the network said of the frame, None without one."""
+        with np.load(self.path) as data:
+            if "opinion_depth" not in data:
+                return None
+            return Opinion(*(data[f"opinion_{name}"] for name in ("depth", "sigma", "confidence", "views")))
+
 
 def stereo(
     frames: Sequence[Frame],
@@ -74,6 +101,7 @@ def stereo(
     max_size: int = 1600,
     neighbours: int = 4,
     seed: int = 0,
+    opinions: Callable[[Views, Array], Opinions] | None = None,
     progress: Progress | None = None,
 ) -> list[DepthMap]:
     """Depth maps of all frames that have a partner.
@@ -85,6 +113,8 @@ def stereo(
         max_size: longest side of the depth maps, pixels.
         neighbours: most partners of a frame.
         seed: of the coarse look's sample.
+        opinions: a network's say in each frame's depth: made from the views and the surface points [M, 3],
+            then asked for a frame and its partners.
         progress: called with (frames done, frames in all).
 
     Raises:
@@ -94,8 +124,9 @@ def stereo(
         raise InputError(f"Stereo needs at least two frames with cameras, not {len(frames)}: give more images.")
     workdir.mkdir(parents=True, exist_ok=True)
     surface = coarse_points(frames, seed=seed) if points is None or len(points) < 20 else np.asarray(points, float)
-    flight = _Views(frames, max_size)
+    flight = Views(frames, max_size)
     ranges = depth_ranges(flight.full, flight.poses, surface)
+    ask = None if opinions is None else opinions(flight, surface)
     partners = choose_partners(
         flight.full, flight.poses, [r[1] for r in ranges], count=neighbours, ratio=BASE_TO_HEIGHT
     )
@@ -118,7 +149,9 @@ def stereo(
             # Pairs of this frame; correlate with every frame that took part, the chosen ones first.
             others = [j for pair in waiting[i] for j in pair if j != i]
             chosen = partners[i] + [j for j in others if j not in partners[i]]
-            _depth(flight, i, waiting[i], chosen[:neighbours], ranges, workdir, path)
+            chosen = chosen[:neighbours]
+            opinion = None if ask is None else ask(i, chosen)
+            _depth(flight, i, waiting[i], chosen, ranges, workdir, path, opinion)
         maps.append(
             DepthMap(
                 frames[i].name, flight.full[i], flight.poses[i], [frames[j].name for j in _all(waiting[i], i)], path
@@ -155,7 +188,7 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
     return [f or (usual[0], usual[1], usual[2]) for f in found]
 
 
-class _Views:
+class Views:
     """Images and cameras of a flight at the two sizes, a few images in memory."""
 
     def __init__(self, frames: Sequence[Frame], max_size: int) -> None:
@@ -178,6 +211,12 @@ class _Views:
         image = cv2.cvtColor(self.frames[i].image(), cv2.COLOR_RGB2GRAY)
         size = (self.lens[i].width, self.lens[i].height)
         return image if image.shape[::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+    def small(self, i: int, camera: Camera) -> NDArray[np.uint8]:
+        """The frame in colour as an undistorted camera of fewer pixels sees it [h, w, 3]."""
+        camera_of = self.frames[i].camera
+        assert camera_of is not None
+        return resample(self.frames[i].image(), camera_of, camera)
 
     def half_gray(self, i: int) -> NDArray[np.uint8]:
         import cv2
@@ -206,7 +245,7 @@ def _pair_file(workdir: Path, pair: tuple[int, int]) -> Path:
 
 
 def _layout(
-    flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]]
+    flight: Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]]
 ) -> tuple[int, int, Rectified | None]:
     """Left frame, right frame and their rectification, None where it is not possible."""
     i, j = pair if ordered((flight.poses[pair[0]], flight.poses[pair[1]])) else pair[::-1]
@@ -218,7 +257,7 @@ def _layout(
     return i, j, layout
 
 
-def _match(flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]], workdir: Path) -> None:
+def _match(flight: Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]], workdir: Path) -> None:
     """Match a pair and keep the left canvas's disparities; an empty file where nothing can be matched."""
     i, j, layout = _layout(flight, pair, ranges)
     found = np.zeros((0, 0), np.int16)
@@ -237,15 +276,16 @@ def _match(flight: _Views, pair: tuple[int, int], ranges: list[tuple[float, floa
 
 
 def _depth(
-    flight: _Views,
+    flight: Views,
     i: int,
     pairs: list[tuple[int, int]],
     chosen: list[int],
     ranges: list[tuple[float, float, float]],
     workdir: Path,
     path: Path,
+    opinion: Opinion | None,
 ) -> None:
-    """Merge the pairs of a frame, refine the depth at full size and keep it."""
+    """Merge the pairs of a frame and the network's opinion, refine the depth at full size and keep it."""
     import cv2
 
     depths: list[Map] = []
@@ -259,6 +299,13 @@ def _depth(
         depth = depth_in_frame(seen, flight.half[i], flight.poses[i], layout, right=left != i)
         depths.append(depth)
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
+    if opinion is not None:
+        half = (flight.half[i].width, flight.half[i].height)
+        seen_again = cv2.resize(opinion.views, half, interpolation=cv2.INTER_NEAREST) >= 2
+        for said, whole in ((opinion.depth, depths), (opinion.sigma, sigmas)):
+            whole.append(
+                np.where(seen_again, cv2.resize(said, half, interpolation=cv2.INTER_LINEAR), np.float32(np.nan))
+            )
     size = (flight.full[i].width, flight.full[i].height)
     if depths:
         depth, sigma, support = consensus(depths, sigmas)
@@ -279,5 +326,6 @@ def _depth(
             sigma=sigma.astype(np.float16),
             support=support,
             score=np.round(np.clip(np.nan_to_num(score, nan=-1), -1, 1) * 100).astype(np.int8),
+            **({} if opinion is None else {f"opinion_{name}": value for name, value in vars(opinion).items()}),
         )
     part.replace(path)

@@ -184,7 +184,8 @@ def _sweep(
         setattr(sweep, name, _warp(getattr(lines, name).detach().flatten(0, 1).contiguous(), "vec3"))
     sweep.apart = _warp(lines.apart.to(torch.uint8).flatten())
     sweep.heights = _warp(heights)
-    sweep.reference, sweep.maps = _warp(_quads(reference.detach()), "vec4"), _warp(_quads(maps.detach().flatten(0, 1)), "vec4")
+    sweep.reference = _warp(_quads(reference.detach()), "vec4")
+    sweep.maps = _warp(_quads(maps.detach().flatten(0, 1)), "vec4")
     sweep.views, sweep.groups = maps.shape[1], groups
     sweep.height, sweep.width = size
     sweep.stride = float(stride)

@@ -27,6 +27,9 @@ class SweepDecoder(nn.Module):
         encoder, generator, discriminator: the other sizes of the three parts, by their constructors' names.
     """
 
+    predicts_surfaces = True
+    """Whether its answer holds ``height``, ``sigma``, ``confidence`` and ``views`` of every pixel."""
+
     def __init__(
         self,
         *,

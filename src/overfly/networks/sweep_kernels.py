@@ -40,7 +40,7 @@ class Sweep:
 
 @wp.func
 def place(s: Sweep, k: int, n: int, z: float):
-    """Cell of frame k's map that ray n meets at height z (first cell's centre at 0), and 1 in the third if it sees it."""
+    """Cell of frame k's map that ray n meets at height z (first cell's centre at 0); 1 in the third if it is seen."""
     nothing = wp.vec3(0.0, 0.0, 0.0)
     if s.apart[k] == wp.uint8(0):
         return nothing
@@ -68,8 +68,16 @@ def tap(s: Sweep, x: int, y: int):
 
 
 @wp.kernel
-def compare(s: Sweep, volume: wp.array4d(dtype=wp.float32), best: wp.array4d(dtype=wp.int8), visible: wp.array4d(dtype=wp.uint8)):
-    """volume [B, 2 G + 1, D, N]; best [B, G, D, N], the frame of the highest similarity; visible [B, V, D, N]; all zero before."""
+def compare(
+    s: Sweep,
+    volume: wp.array4d(dtype=wp.float32),
+    best: wp.array4d(dtype=wp.int8),
+    visible: wp.array4d(dtype=wp.uint8),
+):
+    """volume [B, 2 G + 1, D, N]; best [B, G, D, N], the frame of the highest similarity; visible [B, V, D, N].
+
+    All three are zero before.
+    """
     b, n = wp.tid()
     per_group = s.reference.shape[2] / s.groups
     for d in range(s.heights.shape[1]):
