@@ -21,7 +21,7 @@ ORDER = [
     ["stages"],
     ["callbacks"],
     ["mapping"],
-    ["configuration", "summary", "run_folder", "run"],
+    ["configuration", "summary", "run_folder", "run", "shipped"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

@@ -79,11 +79,11 @@ def fly(
 def map_(
     flight: Annotated[Path, typer.Argument(help="A flight folder, or any folder of drone photos.")],
     out: Annotated[Path, typer.Option(help="Where the map goes.")],
-    network: Annotated[str | None, typer.Option(help="A run folder with trained weights, for --dense sweep.")] = None,
-    cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
-    dense: Annotated[
-        str | None, typer.Option(help="sweep (the network) or stereo. Default: sweep with --network, else stereo.")
+    network: Annotated[
+        str | None, typer.Option(help="For --dense sweep: a run folder of train.py. Default: the shipped network.")
     ] = None,
+    cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
+    dense: Annotated[str, typer.Option(help="sweep (network and stereo together) or stereo alone.")] = "sweep",
     max_memory: Annotated[float | None, typer.Option(help="Memory for the dense step, GB.")] = None,
     resume: Annotated[bool, typer.Option(help="Reuse finished steps of an interrupted map in --out.")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another flight's map in --out.")] = False,
@@ -94,18 +94,15 @@ def map_(
     from overfly.mapping.map import map_flight
 
     run = None
-    if network is not None:
-        from overfly.run import load_run
+    if dense == "sweep":
+        from overfly.shipped import load_network
 
-        run = load_run(network)
-    if dense is None:
-        dense = "stereo" if run is None else "sweep"
-        print(f"--dense {dense}, since {'no' if run is None else 'a'} --network was given", file=sys.stderr)
+        run = load_network(network)
     map_flight(
         flight,
         out=out,
         network=run,
-        network_name=network,
+        network_name=network or "shipped",
         cameras=cameras,
         dense=dense,
         max_memory_gb=max_memory,
@@ -137,6 +134,19 @@ def evaluate(
         json.parent.mkdir(parents=True, exist_ok=True)
         json.write_text(dumps(result, indent=2) + "\n")
     Console().print(format_table(result))
+
+
+@app.command()
+def export(
+    run: Annotated[Path, typer.Argument(help="A run folder of train.py.")],
+    out: Annotated[Path, typer.Option(help="The folder to write into.")],
+    name: Annotated[str, typer.Option(help="By which the network will be asked for.")] = "base",
+) -> None:
+    """Write a run's best weights as safetensors, and beside them how they were trained and what they score."""
+    from overfly.shipped import export as write
+
+    for path in write(run, out, name):
+        print(path)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

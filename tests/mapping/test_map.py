@@ -233,7 +233,7 @@ def test_a_moved_flight_is_still_the_same(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"network": None}, "No trained network is shipped yet"),
+        ({"network": None}, "needs a trained network"),
         ({"dense": "magic"}, "--dense 'magic' is unknown"),
         ({"cameras": "some"}, "--cameras 'some' is unknown"),
         ({"max_memory_gb": 0}, "--max-memory 0"),

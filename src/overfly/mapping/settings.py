@@ -47,7 +47,7 @@ class MapSettings:
             raise unknown("--dense", self.dense, DENSE)
         if self.dense == "sweep" and self.network is None:
             raise InputError(
-                "No trained network is shipped yet: give --network RUN (a run folder of train.py), "
+                "The dense step sweep needs a trained network: give --network RUN (a run folder of train.py), "
                 "or map without one by --dense stereo."
             )
         if self.max_memory_gb is not None and not self.max_memory_gb > 0:

@@ -45,7 +45,7 @@ class SweepOpinions:
 
     def __init__(self, run: TrainedRun, views: Views, points: Array, *, metric: bool = True) -> None:
         self.network, self.views, self.points, self.metric = run.network.eval(), views, points, metric
-        self.cameras = [_octave_camera(camera, run.network.size) for camera in views.full]
+        self.cameras = [octave_camera(camera, run.network.size) for camera in views.full]
         self._image = lru_cache(maxsize=16)(lambda i: views.small(i, self.cameras[i]))
 
     def __call__(self, i: int, partners: list[int]) -> Opinion | None:
@@ -87,7 +87,7 @@ class SweepOpinions:
         return ground, (low, min(high, 0.8 * altitude))
 
 
-def _octave_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+def octave_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     """An undistorted camera at the sizes that a network takes: its shape, about so many pixels, whole octaves.
 
     The picture is stretched a little, by 12 % at most, rather than cut: at low overlap every border is needed.

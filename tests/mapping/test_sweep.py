@@ -1,0 +1,117 @@
+"""A network's surface as a depth map, and what becomes of it in the cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from overfly.geometry import Camera, pixel_grid, rays
+from overfly.mapping.fuse import fuse
+from overfly.mapping.stereo import Opinion, Views, stereo
+from overfly.mapping.sweep import SweepOpinions, octave_camera
+
+GROUND, ABOVE, SIGMA = -3.0, 5.0, 0.7
+
+
+class Level(torch.nn.Module):
+    """Answers that everything lies ``ABOVE`` metres over the ground; it knows the scale of a window by its GSD."""
+
+    size = (64, 64)
+    predicts_surfaces = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.seen: list[dict[str, torch.Tensor]] = []
+
+    def forward(self, batch: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        self.seen.append(batch)
+        b, k, _, h, w = batch["images"].shape
+        flat = torch.ones(b, h, w) / batch["scale"][:, None, None]
+        return {
+            "height": flat * ABOVE,
+            "sigma": flat * SIGMA,
+            "confidence": flat * 0 + 0.6,
+            "views": torch.full((b, h, w), k),
+        }
+
+
+@dataclass
+class Run:
+    network: Any = field(default_factory=Level)
+    config: dict[str, Any] = field(default_factory=dict)
+
+
+def test_heights_over_the_ground_become_depths(hill, strips, camera, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    views = Views(hill.frames(tmp_path, camera, strips[:3], known=True), 1600)
+    x, y = np.meshgrid(np.linspace(-60, 60, 30), np.linspace(-60, 60, 30))
+    points = np.stack([x, y, np.full_like(x, GROUND)], -1).reshape(-1, 3)
+    run = Run()
+    opinion = SweepOpinions(run, views, points)(1, [0, 2])
+    assert opinion is not None
+    small = run.network.seen[0]["images"].shape
+    assert small[1] == 3
+    height, width = opinion.depth.shape
+    assert (height, width) == tuple(small[3:])
+    direction = rays(pixel_grid(width, height), octave_camera(views.full[1], Level.size)) @ strips[1][:3, :3].T
+    expected = (GROUND + ABOVE - strips[1][2, 3]) / direction[..., 2]
+    np.testing.assert_allclose(opinion.depth, expected, rtol=1e-4)
+    tilted = np.abs(direction[..., 2])
+    np.testing.assert_allclose(opinion.sigma, SIGMA / tilted, rtol=1e-3)
+    assert opinion.views.min() == 3
+
+
+def test_the_relief_alone_limits_the_heights_without_a_metric_scale(hill, strips, camera, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    views = Views(hill.frames(tmp_path, camera, strips[:2], known=True), 1600)
+    x, y = np.meshgrid(np.linspace(-60, 60, 30), np.linspace(-60, 60, 30))
+    points = np.stack([x, y, np.full_like(x, GROUND)], -1).reshape(-1, 3)
+    ranges = []
+    for metric in (True, False):
+        run = Run()
+        SweepOpinions(run, views, points, metric=metric)(0, [1])
+        batch = run.network.seen[0]
+        ranges.append(np.ptp(batch["height_range"][0].numpy()) * float(batch["scale"][0]))
+    assert ranges[0] > 50
+    assert ranges[1] < 15
+
+
+@pytest.mark.parametrize("shape", [(4000, 3000), (1600, 900), (6000, 4000), (5280, 3956), (3000, 4000)])
+def test_a_network_sees_whole_pictures_hardly_stretched(shape) -> None:  # type: ignore[no-untyped-def]
+    camera = Camera(*shape, 3000.0, 3000.0, shape[0] / 2, shape[1] / 2)
+    small = octave_camera(camera, (128, 96))
+    assert small.width % 128 == small.height % 128 == 0  # two octaves over multiples of 32
+    assert 0.85 < small.fx / small.fy < 1.18
+    assert small.fov_deg == pytest.approx(camera.fov_deg)
+
+
+def test_where_nothing_matches_the_networks_word_stands_and_is_marked(hill, strips, camera, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    frames = hill.frames(tmp_path, camera, strips[:2], known=True)
+
+    def truthful(views: Views, points: np.ndarray):  # type: ignore[no-untyped-def]
+        def answer(i: int, partners: list[int]) -> Opinion:
+            pose = views.poses[i]
+            at = (hill.surface(views.full[i], pose) - pose[:3, 3]) @ pose[:3, :3]
+            depth = at[..., 2].astype(np.float32)
+            j = partners[0]
+            there = (hill.surface(views.full[i], pose) - views.poses[j][:3, 3]) @ views.poses[j][:3, :3]
+            pixels = there[..., :2] / there[..., 2:] * camera.fx + [camera.cx, camera.cy]
+            seen = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(-1)
+            return Opinion(depth, np.full_like(depth, 0.3), np.full_like(depth, 0.8), 1 + seen.astype(np.uint8))
+
+        return answer
+
+    measured = fuse(stereo(frames, workdir=tmp_path / "stereo"), frames)
+    cloud = fuse(stereo(frames, workdir=tmp_path / "sweep", opinions=truthful), frames)
+    assert not measured.predicted.any()
+    assert 0.2 < cloud.predicted.mean() < 0.6  # what one frame alone sees
+    assert (~cloud.predicted).sum() >= 0.98 * len(measured)
+    assert np.quantile(np.abs(hill.off(cloud.points)), 0.99) < 1.0
+    from scipy.spatial import cKDTree
+
+    far, _ = cKDTree(measured.points[:, :2]).query(cloud.points[cloud.predicted][:, :2])
+    assert np.median(far) > 2.0  # predicted points lie where nothing was measured
+    assert cloud.views[cloud.predicted].max() == 1
