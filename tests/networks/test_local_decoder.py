@@ -100,7 +100,13 @@ def test_one_batch_is_learnt(network: LocalDecoder) -> None:
 @pytest.mark.filterwarnings("ignore:.*does not have many workers")
 def test_every_stage_trains_it(kind: type, network: LocalDecoder) -> None:
     adam = partial(torch.optim.Adam, lr=1e-3)
-    options: dict = {"discriminator_optimizer": adam, "emd_points": 64, "emd_batches": 1, "discriminator_noise": 0.03}
+    options: dict = {
+        "discriminator_optimizer": adam,
+        "emd_points": 64,
+        "emd_batches": 1,
+        "discriminator_noise": 0.03,
+        "discriminator_patches": 1,
+    }
     more = {EncoderStage: {"keypoints": 32, "pixels": 32}, GanStage: {**options, "freeze_encoder": True}}
     loss = {"chamfer": 20.0, "adversarial": 0.02, "correspondence": 1.0, "retrieval": 0.2, "correction": 1.0}
     stage = kind(

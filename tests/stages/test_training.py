@@ -39,7 +39,7 @@ def make_stage(
         "seed": 3,
     }
     players = {"discriminator_optimizer": partial(torch.optim.Adam, lr=1e-3), "emd_points": 64, "emd_batches": 1}
-    players["discriminator_noise"] = 0.03
+    players |= {"discriminator_noise": 0.03, "discriminator_patches": 1}
     if name == "encoder":
         return EncoderStage(**common, pixels=32, keypoints=32, **changes)
     if name == "gan":

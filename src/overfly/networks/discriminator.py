@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from overfly.errors import InputError
 from overfly.networks.blocks import Part
 
 
@@ -42,6 +43,28 @@ class Discriminator(Part):
         pooled = self.convolutions(ordered.transpose(1, 2)).mean(2)
         logits: Tensor = self.head(pooled)[:, 0]
         return logits
+
+
+def patches(points: Tensor, count: int) -> Tensor:
+    """Neighbourhoods of clouds, each about its own centre and at the scale of a whole cloud.
+
+    Args:
+        points: [B, N, 3].
+        count: neighbourhoods of a cloud, a divisor of N; 1 leaves the clouds as they are.
+
+    Returns:
+        [B * count, N / count, 3]: consecutive points along :func:`z_order`.
+
+    Raises:
+        InputError: ``count`` does not divide N.
+    """
+    if count == 1:
+        return points
+    if count < 1 or points.shape[1] % count:
+        raise InputError(f"{points.shape[1]} points do not split into {count} patches: give a divisor, such as 16.")
+    ordered = points.gather(1, z_order(points)[..., None].expand_as(points))
+    local = ordered.unflatten(1, (count, -1)).flatten(0, 1)
+    return (local - local.mean(1, keepdim=True)) * count**0.5
 
 
 @torch.no_grad()

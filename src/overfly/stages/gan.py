@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from overfly import losses
+from overfly.networks.discriminator import patches
 from overfly.stages import surfaces
 from overfly.stages.clouds import window_emd, window_metrics
 from overfly.stages.stage import Batch, OptimizerFactory, Stage, log
@@ -29,6 +30,7 @@ class GanStage(Stage):
         discriminator_noise: standard deviation, in window units, of the noise on x and y of every cloud that the
             discriminator sees. Generated clouds stand in a grid of spacing 2 / 32, real ones do not: without noise it
             would look at nothing else and push the points off the grid instead of onto the surface.
+        discriminator_patches: local patches of a cloud that the discriminator judges one by one; 1: the whole cloud.
         emd_points: size of the random subsets on which the ``emd`` term is computed (0.08 s a window at 1024).
         emd_batches: validation and test batches on which the exact EMD is measured.
         others: see :class:`overfly.stages.stage.Stage`.
@@ -44,6 +46,7 @@ class GanStage(Stage):
         discriminator_optimizer: OptimizerFactory,
         freeze_encoder: bool,
         discriminator_noise: float,
+        discriminator_patches: int,
         emd_points: int,
         emd_batches: int,
         **others: Any,
@@ -51,7 +54,7 @@ class GanStage(Stage):
         super().__init__(**others)
         self.discriminator_optimizer_factory = discriminator_optimizer
         self.freeze_encoder, self.emd_points, self.emd_batches = freeze_encoder, emd_points, emd_batches
-        self.discriminator_noise = discriminator_noise
+        self.discriminator_noise, self.discriminator_patches = discriminator_noise, discriminator_patches
         self.frozen: bool | None = None  # decided when the training begins, kept in checkpoints
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
@@ -165,7 +168,8 @@ class GanStage(Stage):
     def _logits(self, points: Tensor, random: torch.Generator) -> Tensor:
         noise = torch.randn(points.shape, generator=random).to(points) * self.discriminator_noise
         noise[..., 2] = 0
-        logits: Tensor = self.network.discriminator.logits(points + noise)  # type: ignore[union-attr, operator]
+        judged = patches(points + noise, self.discriminator_patches)
+        logits: Tensor = self.network.discriminator.logits(judged)  # type: ignore[union-attr, operator]
         return logits
 
     def _blocks_from_encoder(self) -> str:
@@ -185,7 +189,9 @@ class GanStage(Stage):
 
     def _report_surfaces(self, split: str, output: dict[str, Any], batch: Batch) -> None:
         if "surfaces" in output:
-            self._report(split, *surface_metrics(output, batch))
+            values, count = surface_metrics(output, batch)
+            for name in surfaces.METRICS:  # also those that this batch has nothing for
+                self._report(split, {name: values.get(name, 0.0)}, count if name in values else 0)
 
     def _report_players(self, split: str, on_real: Tensor, on_cloud: Tensor) -> None:
         right = ((on_real > 0).float().mean() + (on_cloud < 0).float().mean()) / 2
