@@ -33,9 +33,9 @@ log = logging.getLogger("overfly")
 def train(cfg: DictConfig) -> float | None:
     """Train what ``stage`` says and return the best value of the monitored metric (None if none was measured)."""
     check(cfg)
+    _check_processes(cfg)
     run_dir = Path(cfg.run_dir)
-    run_dir.mkdir(parents=True, exist_ok=True)
-    save(cfg, run_dir)
+    _open_folder(cfg, run_dir)
     log.info("The run folder is %s", run_dir)
     if cfg.stage_name == "compare":
         return _compare(cfg, run_dir)
@@ -50,12 +50,41 @@ def train(cfg: DictConfig) -> float | None:
             log.info("%s: finished before, its results in %s are kept", name, done.parent)
             value = json.loads(done.read_text()).get("monitored")
         else:
-            Path(part.run_dir).mkdir(parents=True, exist_ok=True)
-            save(part, Path(part.run_dir))
+            _open_folder(part, Path(part.run_dir))
             value = _train_stage(part)
         before = part.run_dir
-        collect(run_dir, list(cfg.phases))
+        if _leads():
+            collect(run_dir, list(cfg.phases))
     return value
+
+
+def _open_folder(cfg: DictConfig, run_dir: Path) -> None:
+    """Make a run folder and write its configuration; of several processes only the first writes and speaks."""
+    if _leads():
+        run_dir.mkdir(parents=True, exist_ok=True)
+        save(cfg, run_dir)
+    else:
+        log.setLevel(logging.WARNING)
+
+
+def _leads() -> bool:
+    """Whether this is the first process of a training, which it is without ``trainer=ddp``."""
+    from lightning.pytorch.utilities import rank_zero_only
+
+    return not getattr(rank_zero_only, "rank", 0)
+
+
+def _check_processes(cfg: DictConfig) -> None:
+    """Each process of ``trainer=ddp`` is started by the whole command, which in a sweep stands for many jobs."""
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+    if sweep and "ddp" in str(cfg.trainer.strategy):
+        raise InputError(
+            "A sweep and trainer=ddp do not go together: give every job of the sweep a command of its own, or one "
+            "process each, side by side: hydra/launcher=joblib hydra.launcher.n_jobs=2."
+        )
 
 
 def _train_stage(cfg: DictConfig) -> float | None:
@@ -226,9 +255,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors come to us, and we say them in one sentence
     register_resolvers()
+    started = list(sys.argv)
+
+    def job(cfg: DictConfig) -> float | None:
+        sys.argv = started  # the command by which Lightning starts the other processes of trainer=ddp
+        return train(cfg)
+
     try:
         sys.argv = ["train.py", *resumed(sys.argv[1:] if argv is None else argv)]
-        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")(train)()
+        hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")(job)()
     except KeyboardInterrupt:
         print(
             "Stopped. What is finished is kept; resume=<the run folder> goes on from the last epoch.", file=sys.stderr

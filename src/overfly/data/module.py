@@ -88,10 +88,16 @@ class FlightDataModule(L.LightningDataModule):
         rank, world = 0, 1
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             rank, world = torch.distributed.get_rank(), torch.distributed.get_world_size()
+        if self.batch_size % world:
+            raise InputError(
+                f"A batch of {self.batch_size} windows does not split among {world} processes: "
+                f"set data.batch_size={max(1, self.batch_size // world) * world}."
+            )
+        sampler = WindowSampler(len(dataset), seed=self.seed, shuffle=shuffle, rank=rank, world=world)
         return DataLoader(
             dataset,
-            batch_size=min(self.batch_size, len(dataset)),
-            sampler=WindowSampler(len(dataset), seed=self.seed, shuffle=shuffle, rank=rank, world=world),
+            batch_size=min(self.batch_size // world, len(sampler)),
+            sampler=sampler,
             num_workers=self.workers,
             drop_last=shuffle,  # batch normalisation of a single window is undefined
             pin_memory=torch.cuda.is_available(),

@@ -108,9 +108,19 @@ class Stage(L.LightningModule):
         for name in parts:
             self.part(name).steps += 1
 
+    def on_validation_start(self) -> None:
+        """Batch statistics become the mean of all processes': so they all measure the same network, and save it."""
+        if self.trainer.world_size > 1:
+            for buffer in self.network.buffers():
+                if buffer.is_floating_point():
+                    buffer.copy_(self.trainer.strategy.reduce(buffer.clone(), reduce_op="mean"))
+
     def report(self, split: str, values: Mapping[str, Tensor | float], count: int) -> None:
-        """Log values as ``<split>/<name>``: their mean over the epoch, each batch weighing ``count``."""
-        if count:
+        """Log values as ``<split>/<name>``: their mean over the epoch and all processes, each batch weighing ``count``.
+
+        What one process cannot measure weighs nothing but is logged all the same: all wait for the same names.
+        """
+        if count or self.trainer.world_size > 1:
             named = {f"{split}/{name}": value for name, value in values.items()}
             self.log_dict(
                 named, on_step=False, on_epoch=True, batch_size=count, sync_dist=True, add_dataloader_idx=False

@@ -14,6 +14,12 @@ from overfly.networks.sweep_generator import Surface
 
 TERMS = ("height", "hypotheses", "sigma", "confidence")
 
+METRICS = (
+    "height_median_gsd", "height_mean_m", "height_mean_percent", "height_mean_m_seen_once", "within_sigma",
+    "within_2sigma",
+)  # fmt: skip
+"""What :func:`surface_metrics` may return."""
+
 RIGHT_PX = 2.0
 """A height counts as right within this number of ground pixels of the octave: what ``confidence`` is about."""
 
