@@ -12,9 +12,9 @@ one method, ``--label`` keeps the maps of several networks beside each other. Ea
     <method>.json      its figures
 
 All surface that at least one image sees counts, walls and borders too. Distances from the cloud are those to the
-scene's triangles (:mod:`surface`); recall asks reference points, uniform by area, for the nearest point of the cloud.
-The cloud is thinned to 0.1 m first. ``--dense exact`` measures the images' true depth, one point per ground pixel: the
-most that a map of this resolution can reach.
+scene's triangles (``truth/surface.py``); recall asks reference points, uniform by area, for the nearest point of the
+cloud. The cloud is thinned to 0.1 m first. ``--dense exact`` measures the images' true depth, one point per ground
+pixel: the most that a map of this resolution can reach. Core-seconds and memory are those of the whole command.
 """
 
 from __future__ import annotations
@@ -27,105 +27,14 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from scipy.spatial import cKDTree
-from surface import Surface
+from truth.case import CELLS, Case, measure
 
-from overfly.cloud import Cloud, read_cloud, voxel_thin
-from overfly.flights import Flight, find_preset, fly, read_flight
-from overfly.flights.launch import default_area
-from overfly.flights.plan import DEFAULT_TILT_DEG
-from overfly.geodesy import enu_from_crs
-from overfly.geometry import Array, pixel_grid, unproject
-from overfly.metrics.functional import THRESHOLDS_M, harmonic
-from overfly.scenes import STYLES, Scene, load_scene, make_scene
+from overfly.metrics.functional import THRESHOLDS_M
+from overfly.scenes import STYLES
 from overfly.tables import markdown, write_rows
-
-CELLS = {"grid-30": ("grid", 30), "grid-50": ("grid", 50), "grid-80": ("grid", 80), "circular-50": ("circular", 50)}
-SEED = 900
-"""Of every landscape here: no training uses seeds this high."""
-
-CAMERA, FRAMES, VOXEL_M = "p4p", 25, 0.1
-STEEP = 0.5
-"""Surfaces whose normal rises less than this are walls, on which an error in height means nothing."""
-
-
-@dataclass
-class Case:
-    """One flight: a style or scene file, flown on a path with an overlap at an altitude (metres)."""
-
-    scene_name: str
-    cell: str
-    altitude: float
-    work: Path
-
-    @property
-    def name(self) -> str:
-        return f"{Path(self.scene_name).stem}_{self.cell}_{self.altitude:g}m"
-
-    @property
-    def folder(self) -> Path:
-        return self.work / self.name
-
-    @cached_property
-    def scene(self) -> Scene:
-        """The landscape; a style's reaches beyond the area flown."""
-        if self.scene_name not in STYLES:
-            return load_scene(self.scene_name)
-        path, overlap = CELLS[self.cell]
-        camera = find_preset(CAMERA).camera(800, 600)
-        area = default_area(path, camera, self.altitude, overlap, overlap, DEFAULT_TILT_DEG[path])
-        return make_scene(self.scene_name, SEED, size_m=float(np.ceil(max(area) + 1.2 * self.altitude)))
-
-    @cached_property
-    def flight(self) -> Flight:
-        """The flight folder, written if it is not there."""
-        folder = self.folder / "flight"
-        if not (folder / "transforms.json").is_file():
-            path, overlap = CELLS[self.cell]
-            options: dict[str, Any] = {"width": 800, "height": 600, "frames": FRAMES, "seed": SEED}
-            fly(self.scene, out=folder, flight_path=path, overlap=overlap, altitude=self.altitude, **options)
-        return read_flight(folder)
-
-    @cached_property
-    def cameras(self) -> tuple[list, list[Array]]:
-        return [f.camera for f in self.flight.frames], [np.asarray(f.world_from_camera) for f in self.flight.frames]
-
-    @cached_property
-    def surface(self) -> Surface:
-        return Surface(self.scene)
-
-    @cached_property
-    def reference(self) -> tuple[Array, Array]:
-        """Points [M, 3] of the surface that images see, uniform by area, and the number of images [M]."""
-        assert self.flight.reference is not None
-        points, kept = read_cloud(self.flight.reference).points, self.folder / "views.npy"
-        if not kept.is_file():
-            np.save(kept, self.surface.count_views(points, *self.cameras))
-        views = np.load(kept)
-        return points[views > 0], views[views > 0]
-
-    def exact_cloud(self) -> Cloud:
-        """What the images see, from their true depth: one point per ground pixel."""
-        parts = []
-        for camera, pose in zip(*self.cameras, strict=True):
-            depth = self.surface.renderer.depth(camera, pose)
-            parts.append(unproject(pixel_grid(camera.width, camera.height)[depth > 0], depth[depth > 0], camera, pose))
-        points = np.concatenate(parts)
-        return Cloud(points[voxel_thin(points, self.altitude / self.cameras[0][0].fx)])
-
-    def map_cloud(self, folder: Path) -> Cloud:
-        """The cloud of a map in the cameras' frame."""
-        cloud = read_cloud(folder / "cloud.laz")
-        if cloud.epsg is None:
-            return cloud
-        assert self.flight.origin is not None
-        return cloud.with_points(enu_from_crs(cloud.points, self.flight.origin, cloud.epsg))
 
 
 def run_map(case: Case, folder: Path, dense: str, network: str | None) -> dict[str, Any]:
@@ -157,40 +66,8 @@ def run_map(case: Case, folder: Path, dense: str, network: str | None) -> dict[s
         "seconds": time.perf_counter() - start,
         "dense_seconds": facts["seconds"]["dense"],
         "peak_mb": peak_kb / 1024,
-        "network": facts["settings"]["network"],
+        "network": network if dense == "sweep" else None,
     }
-
-
-def measure(case: Case, cloud: Cloud) -> dict[str, Any]:
-    """All figures of a cloud in the cameras' frame; lengths in metres, the rest shares."""
-    thin = cloud[voxel_thin(cloud.points, VOXEL_M)]
-    near = case.surface.nearest(thin.points)
-    views = case.surface.count_views(near.place, *case.cameras)
-    reference, seen_by = case.reference
-    missing = cKDTree(thin.points).query(reference, distance_upper_bound=1.01 * max(THRESHOLDS_M))[0]
-    found: dict[str, Any] = {"points": len(cloud)}
-    for t in THRESHOLDS_M:
-        precision, recall = float((near.distance < t).mean()), float((missing < t).mean())
-        found |= {f"fscore_{t:g}": harmonic(precision, recall), f"precision_{t:g}": precision, f"recall_{t:g}": recall}
-    for label, mask in (("1", seen_by == 1), ("2", seen_by == 2), ("3", seen_by >= 3)):
-        found[f"seen_{label}"] = float(mask.mean())
-        found[f"recall_1_seen_{label}"] = share(missing < 1, mask)
-    for label, mask in (("", views >= 2), ("_seen_1", views == 1)):
-        errors = near.distance[mask]
-        found[f"error_median{label}"] = float(np.median(errors)) if len(errors) else None
-        found[f"error_p90{label}"] = float(np.quantile(errors, 0.9)) if len(errors) else None
-    if thin.predicted is not None and thin.sigma_m is not None:
-        found["predicted"] = float(thin.predicted.mean())
-        for label, mask in (("", ~thin.predicted), ("_predicted", thin.predicted)):
-            level = mask & (near.upward > STEEP)
-            for k in (1, 2):
-                found[f"within_{k}_sigma{label}"] = share(near.rise < k * thin.sigma_m, level)
-    return found
-
-
-def share(true: np.ndarray, among: np.ndarray) -> float | None:
-    """The part of ``among`` where ``true`` holds; None of nothing."""
-    return float(true[among].mean()) if among.any() else None
 
 
 def figures(case: Case, method: str, options: argparse.Namespace) -> dict[str, Any]:
@@ -201,7 +78,11 @@ def figures(case: Case, method: str, options: argparse.Namespace) -> dict[str, A
         shutil.rmtree(folder, ignore_errors=True)
     cost, fresh = folder / "cost.json", method in options.again or options.measure
     if kept.is_file() and not fresh:
-        return json.loads(kept.read_text())
+        row = json.loads(kept.read_text())
+        if method == "sweep" and row["network"] != options.network:
+            note = f"{kept} is of the network {row['network']}: give --again sweep, or a --label for this one."
+            raise RuntimeError(note)
+        return row
     spent: dict[str, Any] = {}
     if method != "exact":
         if not cost.is_file():
@@ -226,7 +107,7 @@ def means(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         for key in group[0]:
             values = [r[key] for r in group if isinstance(r.get(key), int | float)]
             if values and key not in row:
-                row[key] = float(np.mean(values))
+                row[key] = sum(values) / len(values)
         found.append(row)
     return found
 
