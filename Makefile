@@ -29,7 +29,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 run: env ## Train the three phases on synthetic flights, map a held-out flight, write a report with pictures
 	$(BIN)/python train.py experiment=demo hydra.run.dir=$(DEMO)/training
-	$(BIN)/python train.py experiment=demo stage=compare from_run=$(DEMO)/training hydra.run.dir=$(DEMO)/compare
+	$(BIN)/python train.py experiment=demo stage=evaluate from_run=$(DEMO)/training hydra.run.dir=$(DEMO)/evaluation
 	$(BIN)/overfly fly suburb --seed 101 --path grid --overlap 60 --side-overlap 50 --altitude 120 --out $(DEMO)/flight
 	$(BIN)/overfly map $(DEMO)/flight --cameras given --dense stereo --out $(DEMO)/map
 	$(BIN)/overfly evaluate $(DEMO)/map/cloud.laz $(DEMO)/flight/reference.laz --json $(DEMO)/map/evaluation.json

@@ -1,4 +1,4 @@
-"""Train, sweep and compare: `python train.py stage=gan overlap=50`; conf/ and README.md say what else it can do."""
+"""Train, sweep and evaluate: `python train.py stage=gan overlap=50`; conf/ and README.md say what else it can do."""
 
 import sys
 

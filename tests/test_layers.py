@@ -21,7 +21,8 @@ ORDER = [
     ["stages"],
     ["callbacks"],
     ["mapping"],
-    ["configuration", "summary", "run_folder", "run", "shipped"],
+    ["evaluation"],
+    ["configuration", "summary", "run_folder", "run", "evaluate", "shipped"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

@@ -161,6 +161,28 @@ def test_resuming_a_finished_run_of_all_phases_computes_nothing_again(train, fin
     assert times == {path: path.stat().st_mtime_ns for path in finished.glob("*/checkpoints/best.ckpt")}
 
 
+def test_an_evaluation_is_one_table_and_one_picture_and_goes_on_where_it_was_stopped(  # type: ignore[no-untyped-def]
+    train, finished: Path, tmp_path: Path
+) -> None:
+    small = ["experiment=smoke", "stage=evaluate", "emd_windows=1", "draws=10", "data.batch_size=3"]
+    train(*small, f"from_run={finished}", f"networks={{encoder only: {finished / 'encoder'}}}")
+    run = only(tmp_path, "outputs/evaluate/*")
+    rows = list(csv.DictReader((run / "evaluation.csv").read_text().splitlines()))
+    clouds = ["flat ground", "correlation sweep", "semi-global stereo", "floor: exact heights", "gan decoder"]
+    assert {*clouds, "encoder only", "mean training cloud", "nearest training window"} < {row["cloud"] for row in rows}
+    assert {row["styles"] for row in rows} == {"all", "seen", "unseen"}
+    assert all(float(row["match_top1"]) >= 0 for row in rows if row["cloud"] == "encoder only")
+    assert (run / "evaluation.png").stat().st_size > 0
+    kept, table = (run / "windows.jsonl").read_text().splitlines(), (run / "evaluation.csv").read_text()
+    assert len(kept) == 12
+    (run / "windows.jsonl").write_text("\n".join(kept[:9]) + "\n" + kept[9][:40])  # as a kill leaves it
+    result = train(f"resume={run.relative_to(tmp_path)}")
+    assert "9 of 12 windows were measured before" in (run / "train.log").read_text() + result.stderr
+    assert (run / "evaluation.csv").read_text() == table
+    refused = train(*small, f"from_run={finished}", f"networks={{gan decoder: {finished}}}", code=2)
+    assert "choose another name" in refused.stderr
+
+
 @pytest.mark.parametrize("stage", ["gan"])
 def test_the_same_seed_gives_bit_equal_metrics_with_any_number_of_workers(train, tmp_path: Path, stage: str) -> None:  # type: ignore[no-untyped-def]
     for name, workers in (("zero", 0), ("two", 2), ("again", 0)):

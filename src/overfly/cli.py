@@ -151,7 +151,7 @@ def export(
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def train(context: typer.Context) -> None:
-    """Train, sweep, compare: the same as `python train.py`, from any folder (`overfly train stage=gan overlap=50`)."""
+    """Train, sweep, evaluate networks: as `python train.py`, from any folder (`overfly train stage=gan overlap=50`)."""
     from overfly.run import main as run
 
     raise SystemExit(run(context.args))

@@ -37,8 +37,11 @@ def train(cfg: DictConfig) -> float | None:
     run_dir = Path(cfg.run_dir)
     _open_folder(cfg, run_dir)
     log.info("The run folder is %s", run_dir)
-    if cfg.stage_name == "compare":
-        return _compare(cfg, run_dir)
+    if cfg.stage_name == "evaluate":
+        from overfly.evaluate import evaluate_run
+
+        _quieten()
+        return evaluate_run(cfg, run_dir)
     if cfg.stage_name != "all":
         return _train_stage(cfg)
     value, before = None, cfg.from_run
@@ -134,38 +137,6 @@ def _train_stage(cfg: DictConfig) -> float | None:
         return monitored
     finally:
         finish_loggers(loggers)
-
-
-def _compare(cfg: DictConfig, run_dir: Path) -> float | None:
-    """``stage=compare``: a table of a trained network beside the baselines; returns its Chamfer distance."""
-    import lightning as L
-
-    from overfly.stages.compare import compare, write_comparison
-
-    if cfg.from_run is None:
-        raise InputError("stage=compare needs a trained network: give from_run=outputs/all/<a run folder>.")
-    _quieten()
-    L.seed_everything(cfg.seed, workers=True, verbose=False)
-    run = load_run(cfg.from_run)
-    trained = OmegaConf.create(run.config)
-    if "source" in trained.data and "cache_dir" in trained.data.source:
-        trained.data.source.cache_dir = cfg.cache_dir
-    data, train_data = build(cfg.data), build(trained.data)
-    for split in data.test_splits:
-        data.datasets[split] = data.dataset(split)
-        data.datasets[split].twice = True
-    rows = compare(
-        run.network,
-        f"{trained.model['_target_'].rsplit('.', 1)[-1]} of {cfg.from_run}",
-        train_data.loader("train"),
-        {split: data.loader(split) for split in data.test_splits},
-        points=cfg.points,
-        second_sample=lambda split, batch: batch["reference_again"],
-    )
-    _, table = write_comparison(rows, run_dir)
-    print(table.read_text())
-    own = [row for row in rows if str(row["cloud"]).endswith(str(cfg.from_run)) and row["split"] == "test"]
-    return float(own[0]["chamfer_m2"]) if own else None
 
 
 def _shows_progress(cfg: DictConfig) -> bool:

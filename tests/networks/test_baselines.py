@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from overfly.errors import InputError
-from overfly.networks.baselines import NearestWindow, lifted, mean_heights
+from overfly.networks.baselines import NearestWindow, interpolated, lifted, mean_heights
 from overfly.networks.ground import initial_cloud
 from terrain import make_batch
 
@@ -27,3 +28,10 @@ def test_nearest_window_answers_with_the_most_similar_windows_reference() -> Non
     assert nearest({"descriptor": asked})[:, 0, 0].tolist() == [2.0, 0.0]
     with pytest.raises(InputError, match="no training window"):
         NearestWindow()({"descriptor": asked})
+
+
+def test_heights_between_points_are_weighed_by_distance() -> None:
+    points = np.array([[0, 0, 1.0], [4, 0, 5.0]])
+    found = interpolated(np.array([[0.0, 0], [2, 0], [1, 0]]), points)
+    assert found == pytest.approx([1, 3, 2])
+    assert interpolated(np.array([[9.0, 9]]), points[:1]) == pytest.approx([1])

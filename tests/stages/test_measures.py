@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -13,10 +11,9 @@ from overfly.metrics import ChamferM, ChamferM2, ChamferSum1024
 from overfly.networks.ground import pixel_centres
 from overfly.networks.matching import cell_pixels, true_correspondences
 from overfly.stages.clouds import window_emd, window_metrics
-from overfly.stages.compare import compare, write_comparison
-from overfly.stages.retrieval import RetrievalTop1
+from overfly.stages.retrieval import RetrievalTop1, window_hits
 from overfly.stages.supervision import correction_errors, matching_counts, overlapping, repeated
-from terrain import make_batch, make_network
+from terrain import make_batch
 
 
 def unit_grid() -> np.ndarray:
@@ -41,6 +38,8 @@ def test_near_counts_within_two_percent_of_the_footprints_width() -> None:
     half = np.where(grid[:, :1] > 0, [[0, 0, 0.039]], [[0, 0, 0.041]])  # the width is 2: 2 % are 0.04
     found = window_metrics(grid + half, grid, 50.0)
     assert found["precision_2pct"] == found["recall_2pct"] == found["near_2pct"] == found["fscore_2pct"] == 0.5
+    assert found["fscore_1pct"] == 0
+    assert window_metrics(grid + np.array([0, 0, 0.019]), grid, 50.0)["fscore_1pct"] == 1
     few = window_metrics(grid[grid[:, 0] > 0], grid, 50.0)
     assert few["precision_2pct"] == 1
     assert few["recall_2pct"] == pytest.approx(0.5)
@@ -100,6 +99,9 @@ def test_retrieval_counts_hits_by_ground_overlap() -> None:
         torch.stack([torch.stack([e[1], F.normalize(e[0] + 0.1 * e[1], dim=0)])]), overlap[None], torch.tensor([1])
     )
     assert top1.compute().item() == pytest.approx(3 / 4)
+    hits, asked = window_hits(torch.cat(top1.descriptors), torch.cat(top1.overlaps), torch.cat(top1.scenes))
+    assert hits.tolist() == [2, 1]
+    assert asked.tolist() == [2, 2]
     # Another window of scene 0 is left out of the gallery; one without any overlap is not asked.
     top1.update(torch.stack([torch.stack([e[0], e[2]])]), torch.eye(2)[None], torch.tensor([0]))
     assert top1.compute().item() == pytest.approx(3 / 4)
@@ -130,24 +132,6 @@ def test_correction_errors_in_metres_and_degrees() -> None:
     right = {"correction": torch.zeros(2, 2, 6)}
     right["correction"][:, 0, 3] = -0.1
     assert correction_errors(right, batch)["corrected_position_m"].item() == pytest.approx(0, abs=1e-3)
-
-
-def test_comparison_has_every_baseline_and_ranks_them(tmp_path: Path) -> None:
-    train, test = [make_batch(3, seed=s) for s in range(2)], [make_batch(2, seed=9)]
-    rows = compare(
-        make_network(), "gan_decoder", train, {"test": test}, points=256, second_sample=lambda split, b: b["reference"]
-    )
-    by_name = {row["cloud"]: row for row in rows}
-    names = ["flat ground", "mean training cloud", "nearest training window", "gan_decoder", "sampling floor"]
-    assert list(by_name) == names
-    assert by_name["sampling floor"]["chamfer_m2"] == 0
-    assert all(row["windows"] == 2 and float(row["height_error_m"]) >= 0 for row in rows)
-    # A window of the training split finds itself.
-    known = compare(make_network(), "x", train, {"train": train}, points=256)
-    assert {row["cloud"]: row["chamfer_m2"] for row in known}["nearest training window"] == 0
-    table, text = write_comparison(rows, tmp_path)
-    assert len(table.read_text().splitlines()) == 6
-    assert "| test | mean training cloud |" in text.read_text()
 
 
 def test_key_points_of_the_analytic_scene_are_truly_there() -> None:

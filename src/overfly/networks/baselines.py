@@ -2,8 +2,7 @@
 
 - *flat ground*: the initial cloud, that is the ground at its prior height;
 - *mean training cloud*: the best constant height of each initial point;
-- *nearest training window*: the reference of the training window that looks most alike;
-- the *sampling floor* is no answer but a limit: what two independent samples of the true surface score.
+- *nearest training window*: the reference of the training window that looks most alike.
 """
 
 from __future__ import annotations
@@ -51,6 +50,14 @@ def lifted(cloud: Tensor, heights: Tensor) -> Tensor:
 def heights_at(xy: NDArray, points: NDArray) -> NDArray[np.float64]:
     """Height of the nearest point in x, y [M] at places [M, 2] of a cloud [N, 3]."""
     heights: NDArray[np.float64] = points[cKDTree(points[:, :2]).query(xy)[1], 2]
+    return heights
+
+
+def interpolated(xy: NDArray, points: NDArray, neighbours: int = 4) -> NDArray[np.float64]:
+    """Height [M] at places [M, 2] between the points [N, 3] nearest in x, y, each weighing its inverse distance."""
+    distance, index = cKDTree(points[:, :2]).query(xy, k=np.arange(1, min(neighbours, len(points)) + 1))
+    weight = 1 / np.maximum(distance, 1e-9)
+    heights: NDArray[np.float64] = (weight * points[index, 2]).sum(1) / weight.sum(1)
     return heights
 
 

@@ -31,7 +31,8 @@ def window_metrics(points: ArrayLike, reference: ArrayLike, scale: float) -> dic
         - ``height_error_m``: mean absolute difference between the height of a reference point and that of the
           predicted point nearest to it in x and y;
         - ``precision_2pct``, ``recall_2pct``, ``near_2pct``, ``fscore_2pct``: shares of predicted points within 2 % of
-          the footprint's width of the reference, the reverse, their mean (the full stage's accuracy), F-score.
+          the footprint's width of the reference, the reverse, their mean (the full stage's accuracy), F-score;
+        - ``fscore_1pct``: the F-score at 1 %.
 
     Raises:
         InputError: a cloud is empty or not finite.
@@ -51,6 +52,7 @@ def window_metrics(points: ArrayLike, reference: ArrayLike, scale: float) -> dic
         "recall_2pct": recall,
         "near_2pct": (precision + recall) / 2,
         "fscore_2pct": found.fscore(near),
+        "fscore_1pct": found.fscore(near / 2),
     }
 
 

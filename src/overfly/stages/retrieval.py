@@ -34,21 +34,33 @@ class RetrievalTop1(Metric):
         self.scenes.append(scenes)
 
     def compute(self) -> Tensor:
-        descriptors, overlaps, scenes = (dim_zero_cat(x) for x in (self.descriptors, self.overlaps, self.scenes))
-        n, k = descriptors.shape[:2]
-        gallery, frame_scene = descriptors.flatten(0, 1), scenes.repeat_interleave(k)
-        window = torch.arange(n, device=scenes.device).repeat_interleave(k)
-        diagonal = torch.eye(k, dtype=torch.bool, device=scenes.device)
-        hits = asked = 0
-        for w in range(n):  # a window at a time: the whole matrix would grow with the square of the split
-            itself = diagonal | (overlaps[w] < 0)
-            likeness = descriptors[w] @ gallery.T  # [K, n K]
-            likeness[:, (frame_scene == scenes[w]) & (window != w)] = -torch.inf
-            likeness[:, w * k : (w + 1) * k].masked_fill_(itself, -torch.inf)
-            best = likeness.argmax(1)
-            common = (overlaps[w] > 0) & ~itself
-            own = (best // k) == w
-            hit = own & common.gather(1, torch.where(own, best % k, torch.zeros_like(best))[:, None])[:, 0]
-            some = common.any(1)
-            hits, asked = hits + int((hit & some).sum()), asked + int(some.sum())
-        return torch.tensor(hits / asked if asked else float("nan"))
+        parts = (dim_zero_cat(x) for x in (self.descriptors, self.overlaps, self.scenes))
+        hits, asked = (x.sum() for x in window_hits(*parts))
+        return hits / asked if asked else torch.tensor(float("nan"))
+
+
+def window_hits(descriptors: Tensor, overlaps: Tensor, scenes: Tensor) -> tuple[Tensor, Tensor]:
+    """How many frames of each window find a frame that overlaps them, and how many overlap any: both [n].
+
+    Args:
+        descriptors: [n, K, D], all windows of a split.
+        overlaps: [n, K, K].
+        scenes: [n].
+    """
+    n, k = descriptors.shape[:2]
+    gallery, frame_scene = descriptors.flatten(0, 1), scenes.repeat_interleave(k)
+    window = torch.arange(n, device=scenes.device).repeat_interleave(k)
+    diagonal = torch.eye(k, dtype=torch.bool, device=scenes.device)
+    hits, asked = torch.zeros(2, n)
+    for w in range(n):  # a window at a time: the whole matrix would grow with the square of the split
+        itself = diagonal | (overlaps[w] < 0)
+        likeness = descriptors[w] @ gallery.T  # [K, n K]
+        likeness[:, (frame_scene == scenes[w]) & (window != w)] = -torch.inf
+        likeness[:, w * k : (w + 1) * k].masked_fill_(itself, -torch.inf)
+        best = likeness.argmax(1)
+        common = (overlaps[w] > 0) & ~itself
+        own = (best // k) == w
+        hit = own & common.gather(1, torch.where(own, best % k, torch.zeros_like(best))[:, None])[:, 0]
+        some = common.any(1)
+        hits[w], asked[w] = (hit & some).sum(), some.sum()
+    return hits, asked

@@ -1,0 +1,87 @@
+"""``stage=evaluate``: trained networks beside classical methods and trivial answers, from a configuration."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from overfly.configuration import build
+from overfly.errors import InputError
+from overfly.evaluation import Baselines, Network, evaluate
+from overfly.evaluation.evaluate import KEPT
+from overfly.run import Run, load_run
+
+log = logging.getLogger("overfly")
+
+
+def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
+    """Evaluate ``from_run`` and ``networks`` on the test and unseen flights of a configuration.
+
+    Args:
+        cfg: with ``from_run``, ``networks`` (run folders by the name in the table), ``emd_windows`` and ``draws``.
+        run_dir: gets evaluation.md, evaluation.csv and evaluation.png; with ``resume`` it goes on where it stopped.
+
+    Returns:
+        Chamfer distance of ``from_run`` over all windows, m².
+
+    Raises:
+        InputError: there is no network or nothing to evaluate on.
+    """
+    if cfg.from_run is None:
+        raise InputError("stage=evaluate needs a trained network: give from_run=outputs/all/<a run folder>.")
+    run = load_run(cfg.from_run)
+    own = _name(run)
+    others = {str(name): load_run(folder) for name, folder in (cfg.networks or {}).items()}
+    if own in others:
+        raise InputError(
+            f"networks calls one {own!r}, which is the name of from_run in the table: choose another name."
+        )
+    networks = {name: Network(r.network, _width(r)) for name, r in {own: run, **others}.items()}
+    data = build(cfg.data)
+    if not data.has_test:
+        raise InputError(
+            "There are no flights to evaluate on: set data.source.images.test or .unseen, or experiment=atlas."
+        )
+    for split in data.test_splits:
+        data.datasets[split] = data.dataset(split)
+        data.datasets[split].twice = True
+    if not cfg.resume:
+        (run_dir / KEPT).unlink(missing_ok=True)
+
+    def baselines() -> Baselines:
+        log.info("Looking at the training windows of %s, for the mean and the nearest one", cfg.from_run)
+        return Baselines(_training_data(run, cfg.cache_dir).loader("train"), networks[own], cfg.points)
+
+    rows = evaluate(
+        networks,
+        baselines,
+        {split: data.loader(split) for split in data.test_splits},
+        run_dir,
+        emd_windows=cfg.emd_windows,
+        draws=cfg.draws,
+        seed=cfg.seed,
+    )
+    log.info("The table is %s, the picture %s", run_dir / "evaluation.md", run_dir / "evaluation.png")
+    return next(float(row["chamfer_m2"]) for row in rows if row["cloud"] == own)
+
+
+def _name(run: Run) -> str:
+    """The kind of network in words: ``sweep decoder``."""
+    kind = run.config["model"]["_target_"].rsplit(".", 1)[-1]
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", kind).lower()
+
+
+def _width(run: Run) -> int:
+    """Width of the images that a network was trained with last, pixels."""
+    return int(run.config["image_size"][0]) // int(run.config["windows"]["shrink"])
+
+
+def _training_data(run: Run, cache_dir: str) -> Any:
+    trained = OmegaConf.create(run.config)
+    if "source" in trained.data and "cache_dir" in trained.data.source:
+        trained.data.source.cache_dir = cache_dir
+    return build(trained.data)
