@@ -22,6 +22,9 @@ from overfly.metrics.functional import THRESHOLDS_M, harmonic
 from overfly.scenes import STYLES, Scene, load_scene, make_scene
 
 CELLS = {"grid-30": ("grid", 30), "grid-50": ("grid", 50), "grid-80": ("grid", 80), "circular-50": ("circular", 50)}
+ORBITS_M, BEYOND_M = 4.0, {"grid": 1.2, "circular": 2.0}
+"""As multiples of the altitude: side of the square that two orbits cover, and how much wider than it the scene is."""
+
 SEED = 900
 """Of every landscape here: no training uses seeds this high."""
 
@@ -57,8 +60,14 @@ class Case:
             return load_scene(self.scene_name)
         path, overlap = CELLS[self.cell]
         camera = find_preset(CAMERA).camera(800, 600)
-        area = default_area(path, camera, self.altitude, overlap, overlap, DEFAULT_TILT_DEG[path])
-        return make_scene(self.scene_name, SEED, size_m=float(np.ceil(max(area) + 1.2 * self.altitude)))
+        usual = default_area(path, camera, self.altitude, overlap, overlap, DEFAULT_TILT_DEG[path])
+        size = (self.area or max(usual)) + BEYOND_M[path] * self.altitude
+        return make_scene(self.scene_name, SEED, size_m=float(np.ceil(size)))
+
+    @property
+    def area(self) -> float | None:
+        """Side in metres of the square flown over: two orbits; None is the usual 5 x 5 frames."""
+        return ORBITS_M * self.altitude if CELLS[self.cell][0] == "circular" else None
 
     @cached_property
     def flight(self) -> Flight:
@@ -67,7 +76,8 @@ class Case:
         if not (folder / "transforms.json").is_file():
             path, overlap = CELLS[self.cell]
             options: dict[str, Any] = {"width": 800, "height": 600, "frames": FRAMES, "seed": SEED}
-            fly(self.scene, out=folder, flight_path=path, overlap=overlap, altitude=self.altitude, **options)
+            options |= {"overlap": overlap, "altitude": self.altitude, "area_m": self.area}
+            fly(self.scene, out=folder, flight_path=path, **options)
         return read_flight(folder)
 
     @cached_property
