@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from overfly.geometry import Camera, pixel_grid, rays
+from overfly.mapping.depth_map import Opinion
 from overfly.mapping.fuse import fuse
-from overfly.mapping.stereo import Opinion, Views, stereo
+from overfly.mapping.stereo import stereo
 from overfly.mapping.sweep import SweepOpinions, octave_camera
+from overfly.mapping.views import Views
 
 GROUND, ABOVE, SIGMA = -3.0, 5.0, 0.7
 

@@ -12,7 +12,7 @@ from overfly.cloud import Cloud, concatenate, voxel_thin
 from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.geometry import unproject
-from overfly.mapping.stereo import DepthMap
+from overfly.mapping.depth_map import DepthMap
 from overfly.mapping.subpixel import Map, frame_to_frame
 
 Progress = Callable[[int, int], None]

@@ -9,88 +9,30 @@ frames at a time whatever the size of the flight.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from overfly.data.windows import resample
 from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, project
 from overfly.mapping.coarse import coarse_points
 from overfly.mapping.consensus import consensus
+from overfly.mapping.depth_map import DepthMap, Map, Opinion
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.neighbours import choose_partners
 from overfly.mapping.rectify import Rectified, ordered, rectify
-from overfly.mapping.subpixel import Shot, refine
+from overfly.mapping.subpixel import refine
+from overfly.mapping.views import Views
 
-Opinions = Callable[[int, list[int]], "Opinion | None"]
+Opinions = Callable[[int, list[int]], Opinion | None]
 Progress = Callable[[int, int], None]
-Map = NDArray[np.float32]
-
 BASE_TO_HEIGHT = (0.04, 0.9)
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels of the matched (half) size."""
 
 REFINED_SIGMA = 0.25
 """The same after refinement, pixels of the full size."""
-
-
-@dataclass(frozen=True)
-class Opinion:
-    """What a network says of a frame before any pixel is matched: maps [h, w] over its undistorted image.
-
-    Attributes:
-        depth: metres, NaN where it knows nothing.
-        sigma: metres, 68 % of the errors are below it.
-        confidence: 0..1, the probability that the depth is right.
-        views: frames that have the place inside, this one included.
-    """
-
-    depth: Map
-    sigma: Map
-    confidence: Map
-    views: NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class DepthMap:
-    """Depth of one frame, kept in a file.
-
-    Attributes:
-        name: of the frame.
-        camera: undistorted, at the size of the maps.
-        world_from_camera: [4, 4].
-        partners: names of the frames it was compared with.
-        path: .npz with depth [H, W] in metres (NaN where unknown), sigma [H, W] in metres, support [H, W], the number
-            of pairs that agree, and score [H, W], the correlation with its best partners (-1..1); with a network,
-            its own ``opinion`` [h, w] too.
-    """
-
-    name: str
-    camera: Camera
-    world_from_camera: Array
-    partners: list[str]
-    path: Path
-
-    def load(self) -> dict[str, NDArray]:
-        with np.load(self.path) as data:
-            return {
-                "depth": data["depth"],
-                "sigma": data["sigma"].astype(np.float32),
-                "support": data["support"],
-                "score": data["score"].astype(np.float32) / 100,
-            }
-
-    def opinion(self) -> Opinion | None:
-        """What the network said of the frame, None without one."""
-        with np.load(self.path) as data:
-            if "opinion_depth" not in data:
-                return None
-            return Opinion(*(data[f"opinion_{name}"] for name in ("depth", "sigma", "confidence", "views")))
 
 
 def stereo(
@@ -188,54 +130,6 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
     return [f or (usual[0], usual[1], usual[2]) for f in found]
 
 
-class Views:
-    """Images and cameras of a flight at the two sizes, a few images in memory."""
-
-    def __init__(self, frames: Sequence[Frame], max_size: int) -> None:
-        self.frames = frames
-        self.poses = [np.asarray(f.world_from_camera, float) for f in frames]
-        self.lens: list[Camera] = []
-        for frame in frames:
-            assert frame.camera is not None
-            factor = min(1.0, max_size / max(frame.width, frame.height))
-            self.lens.append(frame.camera.resized(round(frame.width * factor), round(frame.height * factor)))
-        self.half_lens = [c.resized(max(16, c.width // 2), max(16, c.height // 2)) for c in self.lens]
-        self.full = [c.undistorted() for c in self.lens]
-        self.half = [c.undistorted() for c in self.half_lens]
-        self.gray = lru_cache(maxsize=12)(self._gray)
-        self.shot = lru_cache(maxsize=12)(self._shot)
-
-    def _gray(self, i: int) -> NDArray[np.uint8]:
-        import cv2
-
-        image = cv2.cvtColor(self.frames[i].image(), cv2.COLOR_RGB2GRAY)
-        size = (self.lens[i].width, self.lens[i].height)
-        return image if image.shape[::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-    def small(self, i: int, camera: Camera) -> NDArray[np.uint8]:
-        """The frame in colour as an undistorted camera of fewer pixels sees it [h, w, 3]."""
-        camera_of = self.frames[i].camera
-        assert camera_of is not None
-        return resample(self.frames[i].image(), camera_of, camera)
-
-    def half_gray(self, i: int) -> NDArray[np.uint8]:
-        import cv2
-
-        size = (self.half[i].width, self.half[i].height)
-        return cv2.resize(self.gray(i), size, interpolation=cv2.INTER_AREA)
-
-    def _shot(self, i: int) -> Shot:
-        import cv2
-
-        lens = self.lens[i]
-        image = self.gray(i)
-        if lens.is_distorted:
-            matrix = lens.matrix()
-            matrix[:2, 2] -= 0.5
-            image = cv2.undistort(image, matrix, lens.distortion)
-        return Shot(image.astype(np.float32), self.full[i], self.poses[i])
-
-
 def _all(pairs: list[tuple[int, int]], i: int) -> list[int]:
     return [j for pair in pairs for j in pair if j != i]
 
@@ -309,6 +203,14 @@ def _depth(
     size = (flight.full[i].width, flight.full[i].height)
     if depths:
         depth, sigma, support = consensus(depths, sigmas)
+        if opinion is not None:
+            # The network alone is less exact than a pair: it may be off by more than the last step's pixel.
+            apart = np.isfinite(depth)
+            for paired in depths[:-1]:
+                apart &= ~np.isfinite(paired)
+            others = [flight.half_shot(j) for j in chosen]
+            moved = refine(flight.half_shot(i), others, depth, steps=(-2, -1, 0, 1, 2))
+            depth = np.where(apart, moved.depth, depth)
         full = cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR)
         support = cv2.resize(support, size, interpolation=cv2.INTER_NEAREST)
         refined = refine(flight.shot(i), [flight.shot(j) for j in chosen], full, steps=(-1, -0.5, 0, 0.5, 1), best=2)

@@ -11,7 +11,8 @@ import numpy as np
 from overfly.data.footprints import footprint
 from overfly.data.windows import height_range, window_frame, window_sample
 from overfly.geometry import Array, Camera, project
-from overfly.mapping.stereo import Opinion, Views
+from overfly.mapping.depth_map import Opinion
+from overfly.mapping.views import Views
 
 SIDES = tuple(range(64, 193, 32))
 """Sides that the coarsest octave of a network's images may have, pixels."""

@@ -1,0 +1,67 @@
+"""The depth of one frame: what pairs measured, what a network said, and the file both are kept in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.geometry import Array, Camera
+
+Map = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """What a network says of a frame before any pixel is matched: maps [h, w] over its undistorted image.
+
+    Attributes:
+        depth: metres, NaN where it knows nothing.
+        sigma: metres, 68 % of the errors are below it.
+        confidence: 0..1, the probability that the depth is right.
+        views: frames that have the place inside, this one included.
+    """
+
+    depth: Map
+    sigma: Map
+    confidence: Map
+    views: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of one frame, kept in a file.
+
+    Attributes:
+        name: of the frame.
+        camera: undistorted, at the size of the maps.
+        world_from_camera: [4, 4].
+        partners: names of the frames it was compared with.
+        path: .npz with depth [H, W] in metres (NaN where unknown), sigma [H, W] in metres, support [H, W], the number
+            of pairs that agree, and score [H, W], the correlation with its best partners (-1..1); with a network,
+            its own ``opinion`` [h, w] too.
+    """
+
+    name: str
+    camera: Camera
+    world_from_camera: Array
+    partners: list[str]
+    path: Path
+
+    def load(self) -> dict[str, NDArray]:
+        with np.load(self.path) as data:
+            return {
+                "depth": data["depth"],
+                "sigma": data["sigma"].astype(np.float32),
+                "support": data["support"],
+                "score": data["score"].astype(np.float32) / 100,
+            }
+
+    def opinion(self) -> Opinion | None:
+        """What the network said of the frame, None without one."""
+        with np.load(self.path) as data:
+            if "opinion_depth" not in data:
+                return None
+            return Opinion(*(data[f"opinion_{name}"] for name in ("depth", "sigma", "confidence", "views")))

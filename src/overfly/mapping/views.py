@@ -1,0 +1,70 @@
+"""Images and cameras of a flight at the sizes that the dense step works with, a few images in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.data.windows import resample
+from overfly.flights import Frame
+from overfly.geometry import Camera
+from overfly.mapping.subpixel import Shot
+
+
+class Views:
+    """Images and cameras of a flight at the two sizes, a few images in memory."""
+
+    def __init__(self, frames: Sequence[Frame], max_size: int) -> None:
+        self.frames = frames
+        self.poses = [np.asarray(f.world_from_camera, float) for f in frames]
+        self.lens: list[Camera] = []
+        for frame in frames:
+            assert frame.camera is not None
+            factor = min(1.0, max_size / max(frame.width, frame.height))
+            self.lens.append(frame.camera.resized(round(frame.width * factor), round(frame.height * factor)))
+        self.half_lens = [c.resized(max(16, c.width // 2), max(16, c.height // 2)) for c in self.lens]
+        self.full = [c.undistorted() for c in self.lens]
+        self.half = [c.undistorted() for c in self.half_lens]
+        self.gray = lru_cache(maxsize=12)(self._gray)
+        self.shot = lru_cache(maxsize=12)(self._shot)
+
+    def _gray(self, i: int) -> NDArray[np.uint8]:
+        import cv2
+
+        image = cv2.cvtColor(self.frames[i].image(), cv2.COLOR_RGB2GRAY)
+        size = (self.lens[i].width, self.lens[i].height)
+        return image if image.shape[::-1] == size else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+    def small(self, i: int, camera: Camera) -> NDArray[np.uint8]:
+        """The frame in colour as an undistorted camera of fewer pixels sees it [h, w, 3]."""
+        camera_of = self.frames[i].camera
+        assert camera_of is not None
+        return resample(self.frames[i].image(), camera_of, camera)
+
+    def half_gray(self, i: int) -> NDArray[np.uint8]:
+        import cv2
+
+        size = (self.half[i].width, self.half[i].height)
+        return cv2.resize(self.gray(i), size, interpolation=cv2.INTER_AREA)
+
+    def half_shot(self, i: int) -> Shot:
+        """The undistorted frame at half the working size."""
+        import cv2
+
+        whole, half = self.shot(i), self.half[i]
+        gray = cv2.resize(whole.gray, (half.width, half.height), interpolation=cv2.INTER_AREA)
+        return Shot(gray, half, self.poses[i])
+
+    def _shot(self, i: int) -> Shot:
+        import cv2
+
+        lens = self.lens[i]
+        image = self.gray(i)
+        if lens.is_distorted:
+            matrix = lens.matrix()
+            matrix[:2, 2] -= 0.5
+            image = cv2.undistort(image, matrix, lens.distortion)
+        return Shot(image.astype(np.float32), self.full[i], self.poses[i])
