@@ -80,9 +80,13 @@ def map_(
     flight: Annotated[Path, typer.Argument(help="A flight folder, or any folder of drone photos.")],
     out: Annotated[Path, typer.Option(help="Where the map goes.")],
     network: Annotated[
-        str | None, typer.Option(help="For --dense sweep: a run folder of train.py. Default: the shipped network.")
+        str | None,
+        typer.Option(
+            help="For --dense sweep and --matcher encoder: a run folder of train.py. Default: the shipped network."
+        ),
     ] = None,
     cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
+    matcher: Annotated[str, typer.Option(help="Of key points: sift, encoder (of the network) or both.")] = "sift",
     dense: Annotated[str, typer.Option(help="sweep (network and stereo together) or stereo alone.")] = "sweep",
     max_memory: Annotated[float | None, typer.Option(help="Memory for the dense step, GB.")] = None,
     resume: Annotated[bool, typer.Option(help="Reuse finished steps of an interrupted map in --out.")] = True,
@@ -94,7 +98,7 @@ def map_(
     from overfly.mapping.map import map_flight
 
     run = None
-    if dense == "sweep":
+    if dense == "sweep" or matcher != "sift":
         from overfly.shipped import load_network
 
         run = load_network(network)
@@ -104,6 +108,7 @@ def map_(
         network=run,
         network_name=network or "shipped",
         cameras=cameras,
+        matcher=matcher,
         dense=dense,
         max_memory_gb=max_memory,
         resume=resume,

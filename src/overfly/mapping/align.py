@@ -1,9 +1,7 @@
-"""Cameras estimated from the images: SIFT, verified matches, global mapping, bundle adjustment held by GPS."""
+"""Cameras estimated from the images: verified matches, global mapping, bundle adjustment held by GPS."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,11 @@ from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array, Camera, pose
 from overfly.mapping.block import Block
-from overfly.mapping.database import focal_px, match_pairs, open_database, strongest_pair
-from overfly.mapping.features import features, image_pairs
+from overfly.mapping.database import focal_px, strongest_pair
 from overfly.mapping.georeference import by_gps, by_ground, level_line, on_a_line
+from overfly.mapping.matches import Bar, matched
 from overfly.mapping.model import adjust, centres_and_rotations, mapped, moved
-
-Bar = Callable[[str, str], AbstractContextManager[Callable[..., Any]]]
+from overfly.networks.encoder import Encoder
 
 GPS_SIGMA_M = (0.5, 0.5)
 """Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""
@@ -34,7 +31,9 @@ FAR_OFF_M = 8.0
 FOCAL_DRIFT = 0.1
 
 
-def align(flight: Flight, *, workdir: Path, seed: int, bar: Bar) -> Block:
+def align(
+    flight: Flight, *, workdir: Path, seed: int, bar: Bar, matcher: str = "sift", encoder: Encoder | None = None
+) -> Block:
     """Estimate the cameras of a flight.
 
     Args:
@@ -42,6 +41,8 @@ def align(flight: Flight, *, workdir: Path, seed: int, bar: Bar) -> Block:
         workdir: features, matches and the sparse model are kept here, and reused.
         seed: of every random choice; the same seed gives the same cameras.
         bar: (step, unit) -> context manager of a function that takes (done, total).
+        matcher: what finds the key points: "sift", "encoder" or "both".
+        encoder: of a trained network; not needed by "sift".
 
     Returns:
         The block of the registered frames: in local ENU metres where the images have GPS, else in a levelled frame
@@ -59,7 +60,7 @@ def align(flight: Flight, *, workdir: Path, seed: int, bar: Bar) -> Block:
     workdir.mkdir(parents=True, exist_ok=True)
     warnings: list[str] = []
     origin, told = gps_frame(flight)
-    database, guessed = _matched(flight, told, workdir, seed, bar)
+    database, guessed = matched(flight, told, workdir, matcher=matcher, encoder=encoder, seed=seed, bar=bar)
     if guessed:
         warnings.append(
             f"The focal length of {len(guessed)} images is not known and was estimated from the images alone: "
@@ -98,24 +99,6 @@ def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
             told[i] = enu_from_geodetic([[fix.latitude, fix.longitude, height]], origin)[0]
             told[i, 2] = np.nan if fix.altitude is None else told[i, 2]
     return origin, told
-
-
-def _matched(flight: Flight, told: Array | None, workdir: Path, seed: int, bar: Bar) -> tuple[Path, list[str]]:
-    """The database with verified matches, and the frames whose focal length is a guess."""
-    folder = workdir / "features"
-    folder.mkdir(exist_ok=True)
-    found = []
-    with bar("features", "images") as update:
-        for i, frame in enumerate(flight.frames):
-            found.append(features(frame, folder))
-            update(i + 1, len(flight))
-    database = workdir / "matches.db"
-    _, guessed = open_database(database, flight, found)
-    with bar("pairs", "images") as update:
-        pairs = image_pairs(told, [descriptors for _, descriptors in found], update)
-    with bar("matches", "pairs") as update:
-        match_pairs(database, [f.name for f in flight.frames], pairs, seed=seed, progress=update)
-    return database, guessed
 
 
 def _placed(

@@ -1,4 +1,4 @@
-"""The SIFT database of a flight: cameras, key points and verified matches, filled step by step and kept."""
+"""The COLMAP database of a flight: cameras, key points and verified matches, filled step by step and kept."""
 
 from __future__ import annotations
 
@@ -111,6 +111,51 @@ def match_pairs(
         pairing.match_list_path = str(asked)
         pycolmap.match_image_pairs(path, matching, pairing, verification, device=pycolmap.Device.cpu)
         progress(min(start + CHUNK, len(pairs)), len(pairs))
+
+
+def read_matches(path: Path, names: Sequence[str]) -> dict[tuple[int, int], NDArray[np.uint32]]:
+    """The matches before verification: for pairs of frames (i, j), i < j, rows of indices of key points [m, 2]."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as db:
+        index = {db.read_image_with_name(name).image_id: i for i, name in enumerate(names)}
+        found = {}
+        for pair, rows in zip(*db.read_all_matches(), strict=True):
+            i, j = (index[image] for image in pycolmap.pair_id_to_image_pair(pair))
+            found[min(i, j), max(i, j)] = rows if i < j else rows[:, ::-1]
+    return found
+
+
+def write_matches(
+    path: Path,
+    flight: Flight,
+    found: Sequence[tuple[NDArray, NDArray]],
+    matches: dict[tuple[int, int], NDArray[np.uint32]],
+    *,
+    seed: int,
+) -> list[str]:
+    """A new database with given matches, verified; returns the names of the frames whose focal length was guessed.
+
+    Args:
+        path: the database; one that is there is replaced.
+        flight: its frames.
+        found: pixels [n, 2] and descriptors of each frame; pixels may be more than descriptors.
+        matches: for pairs of frames (i, j), i < j, rows of indices of key points [m, 2].
+        seed: of the verification.
+    """
+    import pycolmap
+
+    path.unlink(missing_ok=True)
+    ids, guessed = open_database(path, flight, found)
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        for (i, j), rows in matches.items():
+            db.write_matches(ids[i], ids[j], rows.astype(np.uint32))
+    asked = path.with_suffix(".txt")
+    asked.write_text("".join(f"{flight.frames[i].name} {flight.frames[j].name}\n" for i, j in matches))
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    pycolmap.verify_matches(path, asked, verification)
+    return guessed
 
 
 def strongest_pair(path: Path) -> int:

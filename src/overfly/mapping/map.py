@@ -58,7 +58,9 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
 def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: Steps) -> dict[str, Any]:
     estimate = asked.cameras == "estimate" or (asked.cameras == "auto" and flight.cameras_from is None)
     steps.say("images", _about(flight))
-    key = key_of(__version__, identity, estimate, asked.seed if estimate else None)
+    network = None if asked.network is None else _network_key(asked)
+    matched = [asked.seed, *([] if asked.matcher == "sift" else [asked.matcher, network])]
+    key = key_of(__version__, identity, estimate, matched if estimate else None)
     block = steps.kept(
         "cameras",
         key,
@@ -68,7 +70,6 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
     )
     steps.say("cameras", _about_block(block, flight))
     check_memory(block, asked)
-    network = None if asked.network is None else _network_key(asked)
     key = key_of(key, asked.dense, network if asked.dense == "sweep" else None, asked.seed)
     make: Callable[[Path], Cloud] = {
         "sweep": lambda scratch: sweep_cloud(block, flight, scratch, asked, steps),
@@ -97,7 +98,10 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
     """Cameras estimated from the images."""
     from overfly.mapping.align import align
 
-    return checked(align(flight, workdir=scratch, seed=asked.seed, bar=steps.bar), flight)
+    encoder = asked.network.network.encoder if asked.network is not None and asked.matcher != "sift" else None
+    return checked(
+        align(flight, workdir=scratch, seed=asked.seed, bar=steps.bar, matcher=asked.matcher, encoder=encoder), flight
+    )
 
 
 def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from overfly.errors import InputError, unknown
+from overfly.mapping.matches import MATCHERS
 from overfly.mapping.sweep import TrainedRun
 
 CAMERAS = ("auto", "given", "estimate")
@@ -18,8 +19,10 @@ class MapSettings:
 
     Attributes:
         cameras: "given" takes those of the flight folder, "estimate" ignores them, "auto" takes them if there are any.
+        matcher: what finds the key points from which cameras are estimated: "sift", the network's "encoder", or "both".
         dense: "sweep" by a trained network, "stereo" by semi-global matching of rectified pairs.
-        network: the trained run (``overfly.run.load_run``); needed by "sweep", unused by "stereo".
+        network: the trained run (``overfly.run.load_run``); needed by "sweep" and by the matcher
+            "encoder", unused by "stereo" and "sift".
         network_name: what the user called it.
         max_memory_gb: memory that the dense step may take; None: no limit.
         resume: reuse finished steps of an earlier map of the same images with the same settings.
@@ -30,6 +33,7 @@ class MapSettings:
     """
 
     cameras: str = "auto"
+    matcher: str = "sift"
     dense: str = "sweep"
     network: TrainedRun | None = None
     network_name: str | None = None
@@ -43,12 +47,19 @@ class MapSettings:
     def __post_init__(self) -> None:
         if self.cameras not in CAMERAS:
             raise unknown("--cameras", self.cameras, CAMERAS)
+        if self.matcher not in MATCHERS:
+            raise unknown("--matcher", self.matcher, MATCHERS)
         if self.dense not in DENSE:
             raise unknown("--dense", self.dense, DENSE)
         if self.dense == "sweep" and self.network is None:
             raise InputError(
                 "The dense step sweep needs a trained network: give --network RUN (a run folder of train.py), "
                 "or map without one by --dense stereo."
+            )
+        if self.matcher != "sift" and self.network is None:
+            raise InputError(
+                f"The matcher {self.matcher} needs a trained network: give --network RUN (a run folder of train.py), "
+                "or match without one by --matcher sift."
             )
         if self.max_memory_gb is not None and not self.max_memory_gb > 0:
             raise InputError(f"--max-memory {self.max_memory_gb} is not possible: give gigabytes above 0, such as 4.")
@@ -58,7 +69,8 @@ class MapSettings:
         return {
             "cameras": self.cameras,
             "dense": self.dense,
-            "network": self.network_name if self.dense == "sweep" else None,
+            "matcher": self.matcher,
+            "network": self.network_name if self.dense == "sweep" or self.matcher != "sift" else None,
             "max_memory_gb": self.max_memory_gb,
             "seed": self.seed,
         }

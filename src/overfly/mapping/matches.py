@@ -1,0 +1,150 @@
+"""The database of a flight's matches: by SIFT, by the encoder of a trained network, or by both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional as F
+
+from overfly.flights import Flight, Frame
+from overfly.geometry import Array, Camera, pose, rotation_from_gimbal
+from overfly.mapping.database import focal_px, match_pairs, open_database, read_matches, write_matches
+from overfly.mapping.encoder_matches import Picture, Prior, match_pair, overlay, picture
+from overfly.mapping.features import MOST_PARTNERS, features, image_pairs
+from overfly.networks.encoder import Encoder
+
+Bar = Callable[[str, str], AbstractContextManager[Callable[..., Any]]]
+Pairs = list[tuple[int, int]]
+Matches = dict[tuple[int, int], NDArray[np.uint32]]
+
+MATCHERS = ("sift", "encoder", "both")
+
+PICTURES = 24
+"""Frames that are held in memory at once."""
+
+
+def matched(
+    flight: Flight, told: Array | None, workdir: Path, *, matcher: str, encoder: Encoder | None, seed: int, bar: Bar
+) -> tuple[Path, list[str]]:
+    """The database with verified matches, and the names of the frames whose focal length is a guess.
+
+    Args:
+        flight: its frames.
+        told: GPS positions [n, 3], NaN where unknown; None without GPS.
+        workdir: SIFT features and matches are kept here, and reused.
+        matcher: "sift", "encoder" or "both".
+        encoder: of a trained network; not needed by "sift".
+        seed: of the verification.
+        bar: (step, unit) -> context manager of a function that takes (done, total).
+    """
+    found: list[tuple[NDArray, NDArray]] = [_nothing() for _ in flight.frames]
+    database, matches = workdir / "matches.db", Matches()
+    if matcher != "encoder":
+        folder = workdir / "features"
+        folder.mkdir(exist_ok=True)
+        with bar("features", "images") as update:
+            for i, frame in enumerate(flight.frames):
+                found[i] = features(frame, folder)
+                update(i + 1, len(flight))
+        _, guessed = open_database(database, flight, found)
+        with bar("pairs", "images") as update:
+            pairs = image_pairs(told, [descriptors for _, descriptors in found], update)
+        with bar("matches", "pairs") as update:
+            match_pairs(database, [f.name for f in flight.frames], pairs, seed=seed, progress=update)
+        if matcher == "sift":
+            return database, guessed
+        matches = read_matches(database, [f.name for f in flight.frames])
+    else:
+        pairs = image_pairs(told, [descriptors for _, descriptors in found])
+    assert encoder is not None
+    known = np.zeros(len(flight), bool) if told is None else np.isfinite(told[:, :2]).all(1)
+    with bar("correspondences", "pairs") as update:
+        pairs = sorted({*pairs, *_alike(flight.frames, np.flatnonzero(~known).tolist(), encoder)})
+        pixels, more = encoder_matches(
+            flight.frames, pairs, encoder, priors=priors(flight.frames, told), progress=update
+        )
+    for (i, j), rows in more.items():
+        rows = rows + np.array([len(found[i][0]), len(found[j][0])], np.uint32)  # behind the points of SIFT
+        matches[i, j] = np.concatenate([matches[i, j], rows]) if (i, j) in matches else rows
+    found = [(np.concatenate([own, others]), d) for (own, d), others in zip(found, pixels, strict=True)]
+    database = workdir / f"matches_{matcher}.db"
+    return database, write_matches(database, flight, found, matches, seed=seed)
+
+
+def encoder_matches(
+    frames: Sequence[Frame],
+    pairs: Sequence[tuple[int, int]],
+    encoder: Encoder,
+    *,
+    priors: Sequence[Prior | None],
+    progress: Callable[[int, int], None],
+) -> tuple[list[Array], Matches]:
+    """Key points and matches of pairs of frames, both ways.
+
+    A frame's own key points are looked for in all its partners, so that its tracks are as long as its partners are
+    many; where they were found in it, the partners' key points follow.
+
+    Returns:
+        Pixels [n_k, 2] of each frame, and for the pairs (i, j), i < j, rows of indices into them [m, 2].
+    """
+
+    @lru_cache(maxsize=PICTURES)
+    def look(k: int) -> Picture:
+        return picture(encoder, frames[k].image(), priors[k])
+
+    pixels = [[look(k).points] for k in range(len(frames))]
+    count = [len(own[0]) for own in pixels]
+    matches: Matches = {}
+    for done, (i, j) in enumerate(pairs):
+        seen_as = overlay(encoder, look(i), look(j))
+        if seen_as is not None:
+            rows = []
+            for a, b, view in ((i, j, seen_as), (j, i, np.asarray(np.linalg.inv(seen_as)))):
+                found = match_pair(encoder, look(a), look(b), view)
+                there = count[b] + np.arange(len(found.rows))
+                pixels[b].append(found.pixels)
+                count[b] += len(found.rows)
+                rows.append(np.column_stack([found.rows, there] if a == i else [there, found.rows]))
+            matches[i, j] = np.concatenate(rows).astype(np.uint32)
+        progress(done + 1, len(pairs))
+    return [np.concatenate(parts) for parts in pixels], matches
+
+
+def priors(frames: Sequence[Frame], told: Array | None) -> list[Prior | None]:
+    """Where each frame was roughly taken from: by GPS, gimbal and the height above the ground, if all are known."""
+    found: list[Prior | None] = []
+    for k, frame in enumerate(frames):
+        focal, above = focal_px(frame), frame.relative_altitude
+        if told is None or np.isnan(told[k, :2]).any() or frame.gimbal is None or focal is None or not (above or 0) > 0:
+            found.append(None)
+            continue
+        camera = Camera(frame.width, frame.height, focal, focal, frame.width / 2, frame.height / 2)
+        found.append(Prior(camera, pose(rotation_from_gimbal(*frame.gimbal), [*told[k, :2], above])))
+    return found
+
+
+@torch.no_grad()
+def _alike(frames: Sequence[Frame], asking: Sequence[int], encoder: Encoder) -> Pairs:
+    """The most alike partners, by the encoder's global descriptors, of frames of which nothing else is known."""
+    import cv2
+
+    if not asking:
+        return []
+    images = [cv2.resize(frame.image(), encoder.size, interpolation=cv2.INTER_AREA) for frame in frames]
+    batch = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
+    descriptors = torch.cat([encoder(part).descriptor for part in batch.split(16)])
+    likeness = F.normalize(descriptors) @ F.normalize(descriptors).T
+    likeness.fill_diagonal_(-torch.inf)
+    best = likeness.topk(min(MOST_PARTNERS, len(frames) - 1)).indices
+    return [(min(i, j), max(i, j)) for i in asking for j in best[i].tolist()]
+
+
+def _nothing() -> tuple[NDArray, NDArray]:
+    return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
