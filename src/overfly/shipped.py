@@ -1,4 +1,4 @@
-"""The networks that come with the package: weights as safetensors, and beside them how they were trained, what they score.
+"""The networks that come with the package: their weights as safetensors, how they were trained, what they score.
 
 They lie in ``overfly/weights`` as ``NAME.safetensors`` and ``NAME.json``; ``overfly export`` writes such a pair.
 """

@@ -116,7 +116,11 @@ def sweep_cloud(block: Block, flight: Flight, scratch: Path, asked: MapSettings,
     if getattr(run.network, "predicts_surfaces", False):
         from overfly.mapping.sweep import SweepOpinions
 
-        return _fused(block, scratch, asked, steps, partial(SweepOpinions, run, metric=block.metric))
+        sparse = block.points is not None and len(block.points) >= FEWEST_POINTS
+        ground = ground_height(block, flight, asked.seed) if block.metric and not sparse else None
+        return _fused(
+            block, scratch, asked, steps, partial(SweepOpinions, run, ground_height=ground, metric=block.metric)
+        )
     from overfly.mapping.network import network_cloud, prior_pose
 
     told = block.gps_positions()

@@ -41,11 +41,16 @@ class SweepOpinions:
         run: the trained network; its configuration is not needed, since it takes images of any size.
         views: the flight's images and cameras.
         points: surface points [M, 3] in the flight's frame, for the height of the ground and the relief.
+        ground_height: of the ground in the flight's frame, where it is better known than by ``points``, which are then
+            not looked at: a first look at cameras without sparse points holds many wrong ones.
         metric: whether the flight's frame is in metres; if not, only the relief limits the heights.
     """
 
-    def __init__(self, run: TrainedRun, views: Views, points: Array, *, metric: bool = True) -> None:
+    def __init__(
+        self, run: TrainedRun, views: Views, points: Array, *, ground_height: float | None = None, metric: bool = True
+    ) -> None:
         self.network, self.views, self.points, self.metric = run.network.eval(), views, points, metric
+        self.ground_height = ground_height
         self.cameras = [octave_camera(camera, run.network.size) for camera in views.full]
         self._image = lru_cache(maxsize=16)(lambda i: views.small(i, self.cameras[i]))
 
@@ -74,6 +79,8 @@ class SweepOpinions:
     def _heights(self, i: int) -> tuple[float, tuple[float, float]]:
         """Height of the ground under a frame, and the heights over it that are looked at."""
         camera, pose = self.views.full[i], self.views.poses[i]
+        if self.ground_height is not None:
+            return self.ground_height, height_range(float(pose[2, 3]) - self.ground_height)
         pixels, _ = project(self.points, camera, pose)
         with np.errstate(invalid="ignore"):
             inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
