@@ -17,6 +17,7 @@ from overfly.mapping.sweep import SweepOpinions, octave_camera
 from overfly.mapping.views import Views
 
 GROUND, ABOVE, SIGMA = -3.0, 5.0, 0.7
+NOTHING = np.zeros((0, 3))
 
 
 class Level(torch.nn.Module):
@@ -53,7 +54,7 @@ def test_heights_over_the_ground_become_depths(hill, strips, camera, tmp_path) -
     x, y = np.meshgrid(np.linspace(-60, 60, 30), np.linspace(-60, 60, 30))
     points = np.stack([x, y, np.full_like(x, GROUND)], -1).reshape(-1, 3)
     run = Run()
-    opinion = SweepOpinions(run, views, points)(1, [0, 2])
+    opinion = SweepOpinions(run, views, points)(1, [0, 2], NOTHING)
     assert opinion is not None
     small = run.network.seen[0]["images"].shape
     assert small[1] == 3
@@ -74,11 +75,24 @@ def test_the_relief_alone_limits_the_heights_without_a_metric_scale(hill, strips
     ranges = []
     for metric in (True, False):
         run = Run()
-        SweepOpinions(run, views, points, metric=metric)(0, [1])
+        SweepOpinions(run, views, points, metric=metric)(0, [1], NOTHING)
         batch = run.network.seen[0]
         ranges.append(np.ptp(batch["height_range"][0].numpy()) * float(batch["scale"][0]))
     assert ranges[0] > 50
     assert ranges[1] < 15
+
+
+def test_what_pairs_have_measured_tells_the_ground_best(hill, strips, camera, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    views = Views(hill.frames(tmp_path, camera, strips[:2], known=True), 1600)
+    x, y = np.meshgrid(np.linspace(-60, 60, 30), np.linspace(-60, 60, 30))
+    wrong = np.stack([x, y, np.full_like(x, -40.0)], -1).reshape(-1, 3)  # a first look full of wrong matches
+    measured = wrong + np.array([0, 0, 40 + GROUND])
+    for ground_height, points, expected in ((1.0, measured, GROUND), (1.0, NOTHING, 1.0), (1.0, wrong, 1.0)):
+        run = Run()
+        opinion = SweepOpinions(run, views, wrong, ground_height=ground_height)(0, [1], points)
+        assert opinion is not None
+        middle = opinion.depth[opinion.depth.shape[0] // 2, opinion.depth.shape[1] // 2]
+        assert strips[0][2, 3] - middle == pytest.approx(expected + ABOVE, abs=1.0)
 
 
 @pytest.mark.parametrize("shape", [(4000, 3000), (1600, 900), (6000, 4000), (5280, 3956), (3000, 4000)])
@@ -94,7 +108,7 @@ def test_where_nothing_matches_the_networks_word_stands_and_is_marked(hill, stri
     frames = hill.frames(tmp_path, camera, strips[:2], known=True)
 
     def truthful(views: Views, points: np.ndarray):  # type: ignore[no-untyped-def]
-        def answer(i: int, partners: list[int]) -> Opinion:
+        def answer(i: int, partners: list[int], measured: np.ndarray) -> Opinion:
             pose = views.poses[i]
             at = (hill.surface(views.full[i], pose) - pose[:3, 3]) @ pose[:3, :3]
             depth = at[..., 2].astype(np.float32)

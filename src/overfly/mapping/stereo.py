@@ -15,7 +15,7 @@ import numpy as np
 
 from overfly.errors import InputError
 from overfly.flights import Frame
-from overfly.geometry import Array, Camera, project
+from overfly.geometry import Array, Camera, project, unproject
 from overfly.mapping.coarse import coarse_points
 from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_map import DepthMap, Map, Opinion
@@ -25,7 +25,9 @@ from overfly.mapping.rectify import Rectified, ordered, rectify
 from overfly.mapping.subpixel import refine
 from overfly.mapping.views import Views
 
-Opinions = Callable[[int, list[int]], Opinion | None]
+Opinions = Callable[[int, list[int], Array], Opinion | None]
+"""What a network says of a frame, given its partners and surface points [M, 3] that its pairs have measured."""
+
 Progress = Callable[[int, int], None]
 BASE_TO_HEIGHT = (0.04, 0.9)
 DISPARITY_SIGMA = 0.4
@@ -55,8 +57,7 @@ def stereo(
         max_size: longest side of the depth maps, pixels.
         neighbours: most partners of a frame.
         seed: of the coarse look's sample.
-        opinions: a network's say in each frame's depth: made from the views and the surface points [M, 3],
-            then asked for a frame and its partners.
+        opinions: a network's say in each frame's depth, made from the views and the surface points [M, 3].
         progress: called with (frames done, frames in all).
 
     Raises:
@@ -92,8 +93,7 @@ def stereo(
             others = [j for pair in waiting[i] for j in pair if j != i]
             chosen = partners[i] + [j for j in others if j not in partners[i]]
             chosen = chosen[:neighbours]
-            opinion = None if ask is None else ask(i, chosen)
-            _depth(flight, i, waiting[i], chosen, ranges, workdir, path, opinion)
+            _depth(flight, i, waiting[i], chosen, ranges, workdir, path, ask)
         maps.append(
             DepthMap(
                 frames[i].name, flight.full[i], flight.poses[i], [frames[j].name for j in _all(waiting[i], i)], path
@@ -128,6 +128,15 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
         )
     usual = tuple(float(np.median([f[k] for f in known])) for k in range(3))
     return [f or (usual[0], usual[1], usual[2]) for f in found]
+
+
+def _sample(depth: Map, camera: Camera, world_from_camera: Array, step: int = 8) -> Array:
+    """World points [M, 3] of every eighth pixel, each way, whose depth is known."""
+    rows, columns = (
+        k[np.isfinite(depth[::step, ::step])] * step
+        for k in np.mgrid[: -(-depth.shape[0] // step), : -(-depth.shape[1] // step)]
+    )
+    return unproject(np.stack([columns + 0.5, rows + 0.5], 1), depth[rows, columns], camera, world_from_camera)
 
 
 def _all(pairs: list[tuple[int, int]], i: int) -> list[int]:
@@ -177,7 +186,7 @@ def _depth(
     ranges: list[tuple[float, float, float]],
     workdir: Path,
     path: Path,
-    opinion: Opinion | None,
+    ask: Opinions | None,
 ) -> None:
     """Merge the pairs of a frame and the network's opinion, refine the depth at full size and keep it."""
     import cv2
@@ -193,6 +202,12 @@ def _depth(
         depth = depth_in_frame(seen, flight.half[i], flight.poses[i], layout, right=left != i)
         depths.append(depth)
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
+    opinion = None
+    if ask is not None:
+        measured = (
+            np.zeros((0, 3)) if not depths else _sample(consensus(depths, sigmas)[0], flight.half[i], flight.poses[i])
+        )
+        opinion = ask(i, chosen, measured)
     if opinion is not None:
         half = (flight.half[i].width, flight.half[i].height)
         seen_again = cv2.resize(opinion.views, half, interpolation=cv2.INTER_NEAREST) >= 2

@@ -20,6 +20,9 @@ SIDES = tuple(range(64, 193, 32))
 OCTAVES = 2
 """Octaves of detail over the coarsest: four times its width."""
 
+FEWEST = 20
+"""Surface points that tell the height of the ground under a frame."""
+
 GROUND_SHARE = 0.3
 """Share of surface points below what is taken for the ground: the others are roofs and trees."""
 
@@ -54,14 +57,20 @@ class SweepOpinions:
         self.cameras = [octave_camera(camera, run.network.size) for camera in views.full]
         self._image = lru_cache(maxsize=16)(lambda i: views.small(i, self.cameras[i]))
 
-    def __call__(self, i: int, partners: list[int]) -> Opinion | None:
-        """The surface of frame i, compared with its partners; None where the frame sees no ground."""
+    def __call__(self, i: int, partners: list[int], measured: Array) -> Opinion | None:
+        """The surface of frame i, compared with its partners; None where the frame sees no ground.
+
+        Args:
+            i: index of the frame.
+            partners: of others.
+            measured: surface points [M, 3] of this frame, by which the ground is known best.
+        """
         import torch
 
         size = self.cameras[i].width, self.cameras[i].height
         chosen = [i, *(j for j in partners if (self.cameras[j].width, self.cameras[j].height) == size)]
         poses = np.stack([self.views.poses[j] for j in chosen])
-        ground, heights = self._heights(i)
+        ground, heights = self._heights(i, measured)
         if poses[0, 2, 3] <= ground or not np.isfinite(footprint(self.cameras[i], poses[0], ground)).all():
             return None
         cameras = [self.cameras[j] for j in chosen]
@@ -76,15 +85,17 @@ class SweepOpinions:
         maps = {name: np.asarray(value[0].float().cpu().numpy(), np.float32) for name, value in found.items()}
         return Opinion(**maps, views=answer["views"][0].cpu().numpy().astype(np.uint8))
 
-    def _heights(self, i: int) -> tuple[float, tuple[float, float]]:
+    def _heights(self, i: int, measured: Array) -> tuple[float, tuple[float, float]]:
         """Height of the ground under a frame, and the heights over it that are looked at."""
-        camera, pose = self.views.full[i], self.views.poses[i]
-        if self.ground_height is not None:
-            return self.ground_height, height_range(float(pose[2, 3]) - self.ground_height)
-        pixels, _ = project(self.points, camera, pose)
-        with np.errstate(invalid="ignore"):
-            inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
-        z = self.points[inside, 2] if inside.sum() >= 20 else self.points[:, 2]
+        pose, z = self.views.poses[i], self._around(i)
+        prior = float(np.quantile(z, GROUND_SHARE)) if self.ground_height is None else self.ground_height
+        usual = height_range(float(pose[2, 3]) - prior)
+        near = measured[:, 2] - prior
+        near = measured[(near > usual[0]) & (near < usual[1]), 2] if self.metric else measured[:, 2]
+        if len(near) >= FEWEST:
+            z = near
+        elif self.ground_height is not None:
+            return prior, usual
         low, ground, high = (float(q) for q in np.quantile(z, [0.005, GROUND_SHARE, 0.995]))
         altitude, relief = float(pose[2, 3]) - ground, high - low
         # Key points are rare on roofs' ridges, tree tops and in pits: leave room.
@@ -93,6 +104,14 @@ class SweepOpinions:
             usual = height_range(altitude)
             low, high = min(low, usual[0]), max(high, usual[1])
         return ground, (low, min(high, 0.8 * altitude))
+
+    def _around(self, i: int) -> Array:
+        """Heights of the surface points in a frame, of all if there are few."""
+        camera, pose = self.views.full[i], self.views.poses[i]
+        pixels, _ = project(self.points, camera, pose)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
+        return self.points[inside, 2] if inside.sum() >= FEWEST else self.points[:, 2]
 
 
 def octave_camera(camera: Camera, size: tuple[int, int]) -> Camera:
