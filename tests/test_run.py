@@ -179,6 +179,7 @@ def test_an_evaluation_is_one_table_and_one_picture_and_goes_on_where_it_was_sto
     result = train(f"resume={run.relative_to(tmp_path)}")
     assert "9 of 12 windows were measured before" in (run / "train.log").read_text() + result.stderr
     assert (run / "evaluation.csv").read_text() == table
+    assert len([json.loads(line) for line in (run / "windows.jsonl").read_text().splitlines()]) == 12
     refused = train(*small, f"from_run={finished}", f"networks={{gan decoder: {finished}}}", code=2)
     assert "choose another name" in refused.stderr
 

@@ -98,6 +98,6 @@ def test_files_for_people_and_programs(tmp_path: Path) -> None:
     assert len(lines) == 1 + len(rows)
     assert "excess_removed_low" in lines[0]
     text = (tmp_path / "evaluation.md").read_text()
-    assert text.count("\n| ") == 2 + len(rows) - 0
+    assert text.count("\n| ") == 2 + len(rows)
     assert "| seen | 30 | all | all | network |" in text
     assert (tmp_path / "evaluation.png").stat().st_size > 10_000

@@ -18,6 +18,7 @@ from overfly.evaluation.answers import Baselines, Batch, Network
 from overfly.evaluation.chart import draw
 from overfly.evaluation.measure import Values, cloud_values, surface_values, truths
 from overfly.evaluation.table import Row, tabulate, write_table
+from overfly.files import replacing
 from overfly.stages.retrieval import window_hits
 from overfly.stages.supervision import matching_counts, repeated
 
@@ -63,6 +64,8 @@ def evaluate(
     kept = _read(folder / KEPT, set(networks))
     total = sum(len(_dataset(loader)) for loader in loaders.values())
     log.info("%d of %d windows were measured before", len(kept), total) if kept else None
+    with replacing(folder / KEPT) as part:  # without what a kill left unfinished
+        part.write_text("".join(json.dumps(window) + "\n" for window in kept.values()))
     others: Baselines | None = None
     started, reported, measured = time.monotonic(), time.monotonic(), 0
     with (folder / KEPT).open("a") as file:
