@@ -31,7 +31,8 @@ def trained(cache: Path, folder: Path, *overrides: str) -> Path:
     folder.mkdir()
     given = [
         "experiment=smoke", f"cache_dir={cache}", "output_root=outputs", "trainer.accelerator=cpu", "test=false",
-        "data.source.images.train=8", "data.source.images_per_flight=4", "data.source.images.val=4", "~callbacks.pictures",
+        "data.source.images.train=8", "data.source.images_per_flight=4", "data.source.images.val=4",
+        "~callbacks.pictures",
         "+callbacks.witness._target_=witness.Witness", f"+callbacks.witness.folder={folder}",
     ]  # fmt: skip
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "tests")}
