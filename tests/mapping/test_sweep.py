@@ -116,7 +116,7 @@ def test_where_nothing_matches_the_networks_word_stands_and_is_marked(hill, stri
             there = (hill.surface(views.full[i], pose) - views.poses[j][:3, 3]) @ views.poses[j][:3, :3]
             pixels = there[..., :2] / there[..., 2:] * camera.fx + [camera.cx, camera.cy]
             seen = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(-1)
-            return Opinion(depth, np.full_like(depth, 0.3), np.full_like(depth, 0.8), 1 + seen.astype(np.uint8))
+            return Opinion(depth, np.full_like(depth, 0.3), np.full_like(depth, 0.8), 1 + seen.astype(np.uint8), depth)
 
         return answer
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.geometry import Array, Camera
-
-Map = NDArray[np.float32]
+from overfly.geometry import Array, Camera, pixel_grid, rays
+from overfly.mapping.anchor import Map, anchored
 
 
 @dataclass(frozen=True)
@@ -22,12 +21,34 @@ class Opinion:
         sigma: metres, 68 % of the errors are below it.
         confidence: 0..1, the probability that the depth is right.
         views: frames that have the place inside, this one included.
+        alone: metres, the depth that this frame suggests without any other.
     """
 
     depth: Map
     sigma: Map
     confidence: Map
     views: NDArray[np.uint8]
+    alone: Map
+
+    def settled(self, measured: Map, camera: Camera, world_from_camera: Array) -> Opinion:
+        """The opinion after the frame was measured: places seen once follow the measured ones around them.
+
+        Args:
+            measured: depth [H, W] of the whole image, NaN where nothing is sure.
+            camera: undistorted, of any size.
+            world_from_camera: [4, 4].
+        """
+        import cv2
+
+        once = self.views < 2
+        if not once.any():
+            return self
+        height, width = self.depth.shape
+        fall = rays(pixel_grid(width, height), camera.resized(width, height)) @ world_from_camera[2, :3]
+        fall = np.minimum(fall, -0.1).astype(np.float32)  # metres down per metre of depth
+        small = cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST)
+        heights = anchored(self.alone * fall, small * fall)
+        return replace(self, depth=np.where(once, heights / fall, self.depth).astype(np.float32))
 
 
 @dataclass(frozen=True)
@@ -64,4 +85,4 @@ class DepthMap:
         with np.load(self.path) as data:
             if "opinion_depth" not in data:
                 return None
-            return Opinion(*(data[f"opinion_{name}"] for name in ("depth", "sigma", "confidence", "views")))
+            return Opinion(*(data[f"opinion_{name}"] for name in ("depth", "sigma", "confidence", "views", "alone")))

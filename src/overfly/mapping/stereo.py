@@ -29,9 +29,12 @@ Opinions = Callable[[int, list[int], Array], Opinion | None]
 """What a network says of a frame, given its partners and surface points [M, 3] that its pairs have measured."""
 
 Progress = Callable[[int, int], None]
-BASE_TO_HEIGHT = (0.04, 0.9)
+BASE_TO_HEIGHT = (0.04, 1.3)
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels of the matched (half) size."""
+
+SURE = 0.6
+"""Correlation from which on a refined depth is taken for measured before any other frame confirms it."""
 
 REFINED_SIGMA = 0.25
 """The same after refinement, pixels of the full size."""
@@ -235,6 +238,9 @@ def _depth(
     else:
         full = np.full(size[::-1], np.nan, np.float32)
         sigma, score, support = full, np.full_like(full, -1), np.zeros(full.shape, np.uint8)
+    if opinion is not None:
+        sure = np.where((score >= SURE) & (support >= 1), full, np.float32(np.nan))
+        opinion = opinion.settled(sure, flight.full[i], flight.poses[i])
     part = path.with_suffix(".part")
     with part.open("wb") as file:
         np.savez(

@@ -20,6 +20,9 @@ SIDES = tuple(range(64, 193, 32))
 OCTAVES = 2
 """Octaves of detail over the coarsest: four times its width."""
 
+PER_FRAME = ("images", "intrinsics", "camera_from_window", "prior_from_window")
+"""What a batch holds of each frame [B, K, ...] and a network looks at."""
+
 FEWEST = 20
 """Surface points that tell the height of the ground under a frame."""
 
@@ -81,7 +84,16 @@ class SweepOpinions:
         with torch.inference_mode():
             answer = self.network(batch)
             depth, along = _depth(answer["height"], batch)
-        found = {"depth": depth * scale, "sigma": answer["sigma"] * along * scale, "confidence": answer["confidence"]}
+            alone = depth
+            if len(chosen) > 1 and bool((answer["views"] < 2).any()):
+                single = {name: value[:, :1] if name in PER_FRAME else value for name, value in batch.items()}
+                alone, _ = _depth(self.network(single)["height"], batch)
+        found = {
+            "depth": depth * scale,
+            "alone": alone * scale,
+            "sigma": answer["sigma"] * along * scale,
+            "confidence": answer["confidence"],
+        }
         maps = {name: np.asarray(value[0].float().cpu().numpy(), np.float32) for name, value in found.items()}
         return Opinion(**maps, views=answer["views"][0].cpu().numpy().astype(np.uint8))
 
