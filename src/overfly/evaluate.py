@@ -22,7 +22,8 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     """Evaluate ``from_run`` and ``networks`` on the test and unseen flights of a configuration.
 
     Args:
-        cfg: with ``from_run``, ``networks`` (run folders by the name in the table), ``emd_windows`` and ``draws``.
+        cfg: with ``from_run``, ``networks`` (run folders by the name in the table), ``emd_windows``, ``every`` and
+            ``draws``.
         run_dir: gets evaluation.md, evaluation.csv and evaluation.png; with ``resume`` it goes on where it stopped.
 
     Returns:
@@ -49,6 +50,7 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     for split in data.test_splits:
         data.datasets[split] = data.dataset(split)
         data.datasets[split].twice = True
+        data.datasets[split].windows = data.datasets[split].windows[:: cfg.every]
     if not cfg.resume:
         (run_dir / KEPT).unlink(missing_ok=True)
 

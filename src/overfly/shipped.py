@@ -97,6 +97,8 @@ def _lines(path: Path) -> list[str]:
 
 
 def _scores(path: Path) -> dict[str, float]:
-    """The validation figures of a finished run."""
-    metrics = json.loads(path.read_text())["metrics"] if path.is_file() else {}
+    """The validation figures of a finished run, of its last phase where it had several."""
+    content = json.loads(path.read_text()) if path.is_file() else {}
+    last = list(content.get("phases", {"": content}).values())[-1]
+    metrics = last.get("metrics", {})
     return {key: round(value, 6) for key, value in metrics.items() if key.startswith("val/")}

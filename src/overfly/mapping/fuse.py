@@ -23,6 +23,9 @@ GATE = 3.0
 WORST_SCORE = {True: 0.2, False: 0.45}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
 
+LEAST_CONFIDENT = 0.4
+"""Predicted points with less confidence are left out: on real flights more of them were wrong than right."""
+
 WIDEST = 2.0
 """Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
 
@@ -155,7 +158,7 @@ def _points(
     # One pair alone must at least agree with itself, seen from its other frame.
     votes = np.maximum(agree, data["support"])
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
-    alone = guessed & (agree == 0)  # predicted: no other frame has measured or guessed the same
+    alone = guessed & (agree == 0) & (data.get("sure", sigma) >= LEAST_CONFIDENT)  # predicted: no other frame agrees
     known |= alone
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
