@@ -31,19 +31,23 @@ def plainly(reference: Tensor, others: Tensor, cast: Lines, heights: Tensor) -> 
     return torch.cat([likeness.sum(1) / count.clamp(min=1), best, count / v], 1), visible
 
 
-@pytest.fixture(scope="module")
-def inputs() -> tuple[Tensor, Tensor, Lines, Tensor]:
-    batch = make_batch(2, frames=4, width=WIDTH, height=HEIGHT)
+def make_inputs(width: int = WIDTH, height: int = HEIGHT, channels: int = 16) -> tuple[Tensor, Tensor, Lines, Tensor]:
+    """Random features of two windows of four frames, the lines of their rays and heights to try."""
+    batch = make_batch(2, frames=4, width=width, height=height)
     aligned = align(batch["images"], batch["intrinsics"], batch["camera_from_window"])
-    cells = pixel_centres(WIDTH, HEIGHT, WIDTH // 2, HEIGHT // 2, torch.device("cpu"))
+    cells = pixel_centres(width, height, width // 2, height // 2, torch.device("cpu"))
     cast = rays(cells, batch["intrinsics"][:, 0], batch["camera_from_window"][:, 0])
     found = lines(cast, aligned.intrinsics, batch["intrinsics"], batch["camera_from_window"], aligned.size)
     random = torch.Generator().manual_seed(0)
-    h, w = (HEIGHT + 2 * (HEIGHT // 8)) // STRIDE, (WIDTH + 2 * (WIDTH // 8)) // STRIDE
-    others = F.normalize(torch.randn(2, 3, 16, h, w, generator=random), dim=2)
-    reference = F.normalize(torch.randn(2, 16, len(cells), generator=random), dim=1)
-    heights = torch.rand(2, 7, len(cells), generator=random) - 0.5
-    return reference, others, found, heights
+    h, w = (height + 2 * (height // 8)) // STRIDE, (width + 2 * (width // 8)) // STRIDE
+    others = F.normalize(torch.randn(2, 3, channels, h, w, generator=random), dim=2)
+    reference = F.normalize(torch.randn(2, channels, len(cells), generator=random), dim=1)
+    return reference, others, found, torch.rand(2, 7, len(cells), generator=random) - 0.5
+
+
+@pytest.fixture(scope="module")
+def inputs() -> tuple[Tensor, Tensor, Lines, Tensor]:
+    return make_inputs()
 
 
 def test_similarities_and_visibility_are_those_of_plain_torch(inputs) -> None:  # type: ignore[no-untyped-def]
