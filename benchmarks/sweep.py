@@ -1,6 +1,6 @@
 """The sweep's kernels beside plain torch, and the shipped network on a frame of one megapixel: `make bench`.
 
-The plain way stands in the tests, so they must be importable: `PYTHONPATH=tests:tests/networks python benchmarks/sweep.py`.
+The plain way stands in the tests, so they must be importable (PYTHONPATH=tests:tests/networks).
 """
 
 from __future__ import annotations
