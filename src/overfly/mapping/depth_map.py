@@ -18,7 +18,7 @@ class Opinion:
 
     Attributes:
         depth: metres, NaN where it knows nothing.
-        sigma: metres, 68 % of the errors are below it.
+        sigma: metres, about 70 % of the errors are below it.
         confidence: 0..1, the probability that the depth is right.
         views: frames that have the place inside, this one included.
         alone: metres, the depth that this frame suggests without any other.

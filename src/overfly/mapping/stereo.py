@@ -29,7 +29,7 @@ Opinions = Callable[[int, list[int], Array], Opinion | None]
 """What a network says of a frame, given its partners and surface points [M, 3] that its pairs have measured."""
 
 Progress = Callable[[int, int], None]
-BASE_TO_HEIGHT = (0.04, 1.3)
+BASE_TO_HEIGHT = (0.04, 0.9)
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels of the matched (half) size."""
 

@@ -80,7 +80,7 @@ class SweepDecoder(nn.Module):
 
         Returns:
             ``points`` [B, points, 3]; ``descriptor`` [B, 1, D] of the reference; ``surfaces``, one a sweep, the last
-            the best; ``height``, ``sigma`` (68 % of the errors are below it), ``confidence`` (0..1) and ``views``
+            the best; ``height``, ``sigma`` (about 70 % of the errors are below it), ``confidence`` (0..1) and ``views``
             (frames that have the point inside) [B, H, W] over the reference image's pixels, window units.
         """
         levels = [self._level(batch, *octave) for octave in self._octaves(batch["images"], batch["intrinsics"])]
