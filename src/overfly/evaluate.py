@@ -17,6 +17,9 @@ from overfly.run import Run, load_run
 
 log = logging.getLogger("overfly")
 
+TRAINING_WINDOWS = 240
+"""Training windows, spread over all flights, among which the mean and the nearest one are looked for."""
+
 
 def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     """Evaluate ``from_run`` and ``networks`` on the test and unseen flights of a configuration.
@@ -56,7 +59,10 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
 
     def baselines() -> Baselines:
         log.info("Looking at the training windows of %s, for the mean and the nearest one", cfg.from_run)
-        return Baselines(_training_data(run, cfg.cache_dir).loader("train"), networks[own], cfg.points)
+        trained = _training_data(run, cfg.cache_dir)
+        looked_at = trained.datasets["train"] = trained.dataset("train")
+        looked_at.windows = looked_at.windows[:: -(-len(looked_at) // TRAINING_WINDOWS)]
+        return Baselines(trained.loader("train"), networks[own], cfg.points)
 
     rows = evaluate(
         networks,

@@ -47,7 +47,7 @@ class Opinion:
         fall = rays(pixel_grid(width, height), camera.resized(width, height)) @ world_from_camera[2, :3]
         fall = np.minimum(fall, -0.1).astype(np.float32)  # metres down per metre of depth
         small = cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST)
-        heights = anchored(self.alone * fall, small * fall)
+        heights = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32))
         return replace(self, depth=np.where(once, heights / fall, self.depth).astype(np.float32))
 
 

@@ -51,8 +51,9 @@ def fuse(
         progress: called with (maps done, maps in all).
 
     Returns:
-        Points with colour; ``views``, the frames that measured them (2 or more); ``sigma_m``, their standard deviation
-        along the ray; ``confidence``, the share of such points that was found right; ``predicted`` False throughout.
+        Points with colour; ``views``, the frames that measured them (2 or more; 1 if predicted); ``sigma_m``, their
+        standard deviation along the ray; ``confidence``, the share of such points that was found right; ``predicted``,
+        the word of a network alone, kept where nothing was matched.
 
     Raises:
         InputError: the maps hold no depth at all.
@@ -61,31 +62,39 @@ def fuse(
     index = {m.name: k for k, m in enumerate(depth_maps)}
     load = lru_cache(maxsize=8)(lambda k: _cleaned(depth_maps[k]))
     used: dict[int, NDArray[np.bool_]] = {}
-    parts: list[Cloud] = []
+    matched: list[Cloud] = []
+    guesses: list[Cloud] = []
     sampling: list[float] = []
     for k, own in enumerate(depth_maps):
         partners = [index[name] for name in own.partners if name in index]
-        cloud, used[k], gsd = _points(own, load(k), {j: load(j) for j in partners}, depth_maps, used, single, by_name)
+        cloud, guessed, used[k], gsd = _points(
+            own, load(k), {j: load(j) for j in partners}, depth_maps, used, single, by_name
+        )
         if len(cloud):
-            parts.append(cloud)
+            matched.append(cloud[~guessed])
+            guesses.append(cloud[guessed])
             sampling.append(gsd)
         # A map is asked by later partners only.
         for j in [j for j in used if all(index.get(n, -1) <= k for n in depth_maps[j].partners)]:
             del used[j]
         if progress:
             progress(k + 1, len(depth_maps))
-    if not parts:
+    if not matched:
         raise InputError(
             "Stereo found no depth in any pair: the images show no texture that matches (water, snow, blur), or the "
             "cameras do not belong to them."
         )
-    cloud = concatenate(parts)
     size = voxel_m or float(np.median(sampling))
+    first, second = (_thinned(concatenate(parts), size) for parts in (matched, guesses))
+    first = first[_accompanied(first.points, 4 * size)] if len(first) else first
+    return concatenate([first, second[_elsewhere(second, first, 3 * size)]])
+
+
+def _thinned(cloud: Cloud, size: float) -> Cloud:
+    """The most confident point of each cube."""
     assert cloud.confidence is not None
     cloud = cloud[np.argsort(-cloud.confidence, kind="stable")]
-    cloud = cloud[voxel_thin(cloud.points, size)]
-    cloud = cloud[_accompanied(cloud.points, 4 * size)]
-    return cloud[_first_hand(cloud, 3 * size)]
+    return cloud[voxel_thin(cloud.points, size)] if len(cloud) else cloud
 
 
 def _cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
@@ -132,8 +141,9 @@ def _points(
     used: Mapping[int, NDArray[np.bool_]],
     single: bool,
     frames: Mapping[str, Frame],
-) -> tuple[Cloud, NDArray[np.bool_], float]:
-    """The points of one map that earlier maps have not given, which pixels are given now, and metres per pixel."""
+) -> tuple[Cloud, NDArray[np.bool_], NDArray[np.bool_], float]:
+    """The points of one map that earlier maps have not given, which of them are the network's word, which pixels are
+    given now, and metres per pixel."""
     depth: Map = data["depth"]
     sigma = data["sigma"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
@@ -180,7 +190,7 @@ def _points(
         predicted=alone[fresh],
     )
     gsd = float(np.median(merged)) / own.camera.fx if len(merged) else float("nan")
-    return cloud, known, gsd
+    return cloud, guessed[fresh], known, gsd
 
 
 def _look_up(
@@ -232,12 +242,15 @@ def _confidence(votes: NDArray, agree: NDArray, score: NDArray) -> NDArray[np.fl
     return (base * np.clip(0.4 + 0.7 * score, 0, 1)).astype(np.float32)
 
 
-def _first_hand(cloud: Cloud, size: float) -> NDArray[np.bool_]:
-    """Points that are measured, and predicted ones in whose cell of the plan nothing is measured."""
-    assert cloud.predicted is not None
-    cells = np.floor((cloud.points[:, :2] - cloud.points[:, :2].min(0)) / size).astype(np.int64)
-    plan = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    return ~cloud.predicted | ~np.isin(plan, plan[~cloud.predicted])
+def _elsewhere(guesses: Cloud, matched: Cloud, size: float) -> NDArray[np.bool_]:
+    """Guessed points in whose cell of the plan nothing was matched: what is measured needs no guess beside it."""
+    if not len(guesses) or not len(matched):
+        return np.ones(len(guesses), bool)
+    low = np.minimum(guesses.points[:, :2].min(0), matched.points[:, :2].min(0))
+    cells = [np.floor((cloud.points[:, :2] - low) / size).astype(np.int64) for cloud in (guesses, matched)]
+    columns = max(int(c[:, 1].max()) for c in cells) + 1
+    plan = [c[:, 0] * columns + c[:, 1] for c in cells]
+    return ~np.isin(*plan)
 
 
 def _accompanied(points: NDArray, size: float) -> NDArray[np.bool_]:
