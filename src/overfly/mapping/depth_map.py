@@ -61,8 +61,8 @@ class DepthMap:
         world_from_camera: [4, 4].
         partners: names of the frames it was compared with.
         path: .npz with depth [H, W] in metres (NaN where unknown), sigma [H, W] in metres, support [H, W], the number
-            of pairs that agree, and score [H, W], the correlation with its best partners (-1..1); with a network,
-            its own ``opinion`` [h, w] too.
+            of pairs that agree, and score [H, W], the correlation with its best partners (-1..1), and paired
+            [H, W], whether any pair was matched there; with a network, its own ``opinion`` [h, w] too.
     """
 
     name: str
@@ -78,6 +78,7 @@ class DepthMap:
                 "sigma": data["sigma"].astype(np.float32),
                 "support": data["support"],
                 "score": data["score"].astype(np.float32) / 100,
+                "paired": data["paired"],
             }
 
     def opinion(self) -> Opinion | None:

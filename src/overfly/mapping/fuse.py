@@ -129,6 +129,7 @@ def _cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
         "sigma": np.where(guessed, sigma, data["sigma"]),
         "support": np.where(guessed, 0, data["support"]).astype(np.uint8),
         "guessed": guessed,
+        "second": guessed | ~data["paired"],
         "sure": sure,
     }
 
@@ -142,7 +143,7 @@ def _points(
     single: bool,
     frames: Mapping[str, Frame],
 ) -> tuple[Cloud, NDArray[np.bool_], NDArray[np.bool_], float]:
-    """The points of one map that earlier maps have not given, which of them are the network's word, which pixels are
+    """The points of one map that earlier maps have not given, which of them no pair has matched, which pixels are
     given now, and metres per pixel."""
     depth: Map = data["depth"]
     sigma = data["sigma"]
@@ -190,7 +191,7 @@ def _points(
         predicted=alone[fresh],
     )
     gsd = float(np.median(merged)) / own.camera.fx if len(merged) else float("nan")
-    return cloud, guessed[fresh], known, gsd
+    return cloud, data.get("second", guessed)[fresh], known, gsd
 
 
 def _look_up(

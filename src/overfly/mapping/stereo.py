@@ -221,12 +221,14 @@ def _depth(
     size = (flight.full[i].width, flight.full[i].height)
     if depths:
         depth, sigma, support = consensus(depths, sigmas)
+        paired = np.isfinite(depth)
         if opinion is not None:
             # The network alone is less exact than a pair: it may be off by more than the last step's pixel.
             apart = np.isfinite(depth)
             for paired in depths[:-1]:
                 apart &= ~np.isfinite(paired)
             others = [flight.half_shot(j) for j in chosen]
+            paired = ~apart
             moved = refine(flight.half_shot(i), others, depth, steps=(-2, -1, 0, 1, 2))
             depth = np.where(apart, moved.depth, depth)
         full = cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR)
@@ -235,9 +237,11 @@ def _depth(
         full, score = refined.depth, refined.score
         sigma = refined.step * np.float32(REFINED_SIGMA)
         support[~np.isfinite(full)] = 0
+        paired = cv2.resize(paired.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     else:
         full = np.full(size[::-1], np.nan, np.float32)
         sigma, score, support = full, np.full_like(full, -1), np.zeros(full.shape, np.uint8)
+        paired = support > 0
     if opinion is not None:
         sure = np.where((score >= SURE) & (support >= 1), full, np.float32(np.nan))
         opinion = opinion.settled(sure, flight.full[i], flight.poses[i])
@@ -249,6 +253,7 @@ def _depth(
             sigma=sigma.astype(np.float16),
             support=support,
             score=np.round(np.clip(np.nan_to_num(score, nan=-1), -1, 1) * 100).astype(np.int8),
+            paired=paired,
             **({} if opinion is None else {f"opinion_{name}": value for name, value in vars(opinion).items()}),
         )
     part.replace(path)
