@@ -205,32 +205,25 @@ def _depth(
         depth = depth_in_frame(seen, flight.half[i], flight.poses[i], layout, right=left != i)
         depths.append(depth)
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
-    opinion = None
-    if ask is not None:
-        measured = (
-            np.zeros((0, 3)) if not depths else _sample(consensus(depths, sigmas)[0], flight.half[i], flight.poses[i])
-        )
-        opinion = ask(i, chosen, measured)
-    if opinion is not None:
-        half = (flight.half[i].width, flight.half[i].height)
-        seen_again = cv2.resize(opinion.views, half, interpolation=cv2.INTER_NEAREST) >= 2
-        for said, whole in ((opinion.depth, depths), (opinion.sigma, sigmas)):
-            whole.append(
-                np.where(seen_again, cv2.resize(said, half, interpolation=cv2.INTER_LINEAR), np.float32(np.nan))
-            )
-    size = (flight.full[i].width, flight.full[i].height)
+    half = flight.half[i]
+    shape = half.height, half.width
     if depths:
         depth, sigma, support = consensus(depths, sigmas)
-        paired = np.isfinite(depth)
-        if opinion is not None:
-            # The network alone is less exact than a pair: it may be off by more than the last step's pixel.
-            apart = np.isfinite(depth)
-            for paired in depths[:-1]:
-                apart &= ~np.isfinite(paired)
-            others = [flight.half_shot(j) for j in chosen]
-            paired = ~apart
-            moved = refine(flight.half_shot(i), others, depth, steps=(-2, -1, 0, 1, 2))
-            depth = np.where(apart, moved.depth, depth)
+    else:
+        depth, support = np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
+    paired = np.isfinite(depth)
+    opinion = None if ask is None else ask(i, chosen, _sample(depth, half, flight.poses[i]))
+    if opinion is not None:
+        # It has no vote where pairs were matched: with its wide sigma it would agree with wrong matches, too.
+        said = cv2.resize(opinion.depth, shape[::-1], interpolation=cv2.INTER_LINEAR)
+        seen_again = cv2.resize(opinion.views, shape[::-1], interpolation=cv2.INTER_NEAREST) >= 2
+        fill = ~paired & seen_again & np.isfinite(said)
+        # The network is less exact than a pair: it may be off by more than the last step's pixel.
+        others = [flight.half_shot(j) for j in chosen]
+        moved = refine(flight.half_shot(i), others, np.where(fill, said, depth), steps=(-2, -1, 0, 1, 2))
+        depth, support = np.where(fill, moved.depth, depth), np.where(fill, np.uint8(1), support)
+    size = (flight.full[i].width, flight.full[i].height)
+    if np.isfinite(depth).any():
         full = cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR)
         support = cv2.resize(support, size, interpolation=cv2.INTER_NEAREST)
         refined = refine(flight.shot(i), [flight.shot(j) for j in chosen], full, steps=(-1, -0.5, 0, 0.5, 1), best=2)
