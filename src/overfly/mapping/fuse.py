@@ -23,8 +23,11 @@ GATE = 3.0
 WORST_SCORE = {True: 0.2, False: 0.45}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
 
-LEAST_CONFIDENT = 0.4
-"""Predicted points with less confidence are left out: on real flights more of them were wrong than right."""
+LEAST_CONFIDENT = 0.5
+"""Points that no pair has matched are left out with less confidence: on a real flight most of those were wrong."""
+
+NEAR = 30
+"""Points that no pair has matched are left out within this many ground pixels, in plan, of those that one has."""
 
 WIDEST = 2.0
 """Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
@@ -87,7 +90,9 @@ def fuse(
     size = voxel_m or float(np.median(sampling))
     first, second = (_thinned(concatenate(parts), size) for parts in (matched, guesses))
     first = first[_accompanied(first.points, 4 * size)] if len(first) else first
-    return concatenate([first, second[_elsewhere(second, first, 3 * size)]])
+    assert second.confidence is not None
+    second = second[second.confidence >= LEAST_CONFIDENT]
+    return concatenate([first, second[_elsewhere(second, first, NEAR * size)]])
 
 
 def _thinned(cloud: Cloud, size: float) -> Cloud:
@@ -169,7 +174,7 @@ def _points(
     # One pair alone must at least agree with itself, seen from its other frame.
     votes = np.maximum(agree, data["support"])
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
-    alone = guessed & (agree == 0) & (data.get("sure", sigma) >= LEAST_CONFIDENT)  # predicted: no other frame agrees
+    alone = guessed & (agree == 0)  # predicted: no other frame agrees
     known |= alone
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
