@@ -15,6 +15,7 @@ ORDER = [
     ["ply", "files", "cloud", "mesh"],
     ["losses", "metrics"],
     ["scenes"],
+    ["rendering"],
     ["flights"],
     ["data"],
     ["networks"],

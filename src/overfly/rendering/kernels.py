@@ -1,0 +1,438 @@
+# mypy: ignore-errors
+# ruff: noqa: SIM109, UP018, RUF046 (Kernels are written in the language of warp, which only looks like Python.)
+"""The renderer's inner loops as warp kernels, one source for CPU and CUDA, with gradients worked out by hand.
+
+Positions are float64, so that what is seen, where an edge lies and what is interpolated never contradict each other by
+rounding; images are float32, four channels at a time. Every kernel handles all views (``b``) in one launch.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR
+wp.set_module_options({"enable_backward": False})
+
+STEPS = wp.constant(64)
+"""Faces that a walk from one pixel to the next may cross."""
+
+SLACK = wp.constant(wp.float64(1e-9))
+"""Pixels by which rounding may misplace the crossing of an edge and a row."""
+
+
+@wp.func
+def line(p: wp.vec3d, q: wp.vec3d):
+    """(a, b, c) with ``a x + b y + c`` positive to the right of p -> q where y points down."""
+    return wp.vec3d(p[1] - q[1], q[0] - p[0], p[0] * q[1] - q[0] * p[1])
+
+
+@wp.func
+def side(p: wp.vec3d, q: wp.vec3d, i: int, j: int, sign: wp.float64):
+    """The same for the vertices i and j, to the last bit the negative of ``side(q, p, j, i, sign)``."""
+    if i < j:
+        return sign * line(p, q)
+    return -sign * line(q, p)
+
+
+@wp.func
+def inside(e: wp.float64, s: wp.vec3d):
+    """Whether a value of ``side`` counts as inside; a pixel centre on a shared edge belongs to one of its faces."""
+    zero = wp.float64(0.0)
+    return e > zero or (e == zero and (s[0] > zero or (s[0] == zero and s[1] > zero)))
+
+
+@wp.kernel
+def cover(
+    screen: wp.array2d(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    width: int,
+    height: int,
+    nearest: wp.array2d(dtype=wp.int64),
+):
+    """The nearest face of every pixel: nearest [B, H W] = bits of the depth, then of the face; 2**63 - 1 before.
+
+    screen [B, V] = x, y in pixels, 1 / depth (0: not seen). The bits of positive floats sort as the floats do.
+    """
+    b, f = wp.tid()
+    v = faces[f]
+    p0 = screen[b, v[0]]
+    p1 = screen[b, v[1]]
+    p2 = screen[b, v[2]]
+    zero = wp.float64(0.0)
+    half = wp.float64(0.5)
+    if p0[2] <= zero or p1[2] <= zero or p2[2] <= zero:
+        return
+    left = wp.ceil(wp.min(p0[0], wp.min(p1[0], p2[0])) - half)
+    right = wp.floor(wp.max(p0[0], wp.max(p1[0], p2[0])) - half)
+    top = wp.ceil(wp.min(p0[1], wp.min(p1[1], p2[1])) - half)
+    bottom = wp.floor(wp.max(p0[1], wp.max(p1[1], p2[1])) - half)
+    if not (left <= right and top <= bottom):
+        return
+    x_first = int(wp.max(left, zero))
+    x_last = int(wp.min(right, wp.float64(width - 1)))
+    y_first = int(wp.max(top, zero))
+    y_last = int(wp.min(bottom, wp.float64(height - 1)))
+    area = (p1[0] - p0[0]) * (p2[1] - p0[1]) - (p1[1] - p0[1]) * (p2[0] - p0[0])
+    if not wp.abs(area) > zero:
+        return
+    sign = wp.sign(area)
+    s0 = side(p1, p2, v[1], v[2], sign)
+    s1 = side(p2, p0, v[2], v[0], sign)
+    s2 = side(p0, p1, v[0], v[1], sign)
+    for y in range(y_first, y_last + 1):
+        py = wp.float64(y) + half
+        r0 = s0[1] * py + s0[2]
+        r1 = s1[1] * py + s1[2]
+        r2 = s2[1] * py + s2[2]
+        for x in range(x_first, x_last + 1):
+            px = wp.float64(x) + half
+            e0 = s0[0] * px + r0
+            e1 = s1[0] * px + r1
+            e2 = s2[0] * px + r2
+            if inside(e0, s0) and inside(e1, s1) and inside(e2, s2):
+                z = wp.float32((e0 + e1 + e2) / (e0 * p0[2] + e1 * p1[2] + e2 * p2[2]))
+                key = wp.int64(wp.cast(z, wp.int32)) * wp.int64(4294967296) + wp.int64(f)
+                wp.atomic_min(nearest, b, y * width + x, key)
+
+
+@wp.struct
+class Hit:
+    """Where a ray meets a face: barycentrics of corners 1 and 2, depth; and the rows of the inverse of (e1, e2, -ray).
+
+    The ray's point ``depth ray = p0 + b1 e1 + b2 e2`` fixes all three, so that their change is the inverse times
+    ``depth d(ray) - sum b_i d(p_i)``: all that the gradient needs.
+    """
+
+    b0: wp.float64
+    b1: wp.float64
+    b2: wp.float64
+    depth: wp.float64
+    row1: wp.vec3d
+    row2: wp.vec3d
+    row3: wp.vec3d
+
+
+@wp.func
+def meet(p0: wp.vec3d, p1: wp.vec3d, p2: wp.vec3d, ray: wp.vec3d):
+    hit = Hit()
+    e1 = p1 - p0
+    e2 = p2 - p0
+    h = wp.cross(ray, e2)
+    det = wp.dot(e1, h)
+    if det == wp.float64(0.0):  # seen exactly edge-on: a constant
+        hit.b0 = wp.float64(1.0)
+        hit.depth = p0[2]
+        return hit
+    hit.row1 = h / det
+    hit.row2 = wp.cross(e1, ray) / det
+    hit.row3 = wp.cross(e1, e2) / det
+    hit.b1 = -wp.dot(p0, hit.row1)
+    hit.b2 = -wp.dot(p0, hit.row2)
+    hit.b0 = wp.float64(1.0) - hit.b1 - hit.b2
+    hit.depth = -wp.dot(p0, hit.row3)
+    return hit
+
+
+@wp.kernel
+def blend_corners(
+    points: wp.array2d(dtype=wp.vec3d),
+    attributes: wp.array2d(dtype=wp.vec4),
+    faces: wp.array(dtype=wp.vec3i),
+    face: wp.array3d(dtype=wp.int32),
+    ray_x: wp.array2d(dtype=wp.float64),
+    ray_y: wp.array2d(dtype=wp.float64),
+    values: wp.array4d(dtype=wp.vec4),
+    depth: wp.array3d(dtype=wp.float32),
+):
+    """values [B, H, W, C / 4] and depth [B, H, W], zero before, where ray (ray_x [B, W], ray_y [B, H], 1) meets face.
+
+    points [B, V] in camera axes; attributes [V, C / 4].
+    """
+    b, y, x = wp.tid()
+    f = face[b, y, x]
+    if f >= 0:
+        v = faces[f]
+        ray = wp.vec3d(ray_x[b, x], ray_y[b, y], wp.float64(1.0))
+        hit = meet(points[b, v[0]], points[b, v[1]], points[b, v[2]], ray)
+        b0 = wp.float32(hit.b0)
+        b1 = wp.float32(hit.b1)
+        b2 = wp.float32(hit.b2)
+        for c in range(attributes.shape[1]):
+            values[b, y, x, c] = b0 * attributes[v[0], c] + b1 * attributes[v[1], c] + b2 * attributes[v[2], c]
+        depth[b, y, x] = wp.float32(hit.depth)
+
+
+@wp.kernel
+def blend_corners_backward(
+    points: wp.array2d(dtype=wp.vec3d),
+    attributes: wp.array2d(dtype=wp.vec4),
+    faces: wp.array(dtype=wp.vec3i),
+    face: wp.array3d(dtype=wp.int32),
+    ray_x: wp.array2d(dtype=wp.float64),
+    ray_y: wp.array2d(dtype=wp.float64),
+    of_values: wp.array4d(dtype=wp.vec4),
+    of_depth: wp.array3d(dtype=wp.float32),
+    to_points: wp.array2d(dtype=wp.vec3d),
+    to_attributes: wp.array2d(dtype=wp.vec4),
+    to_ray_x: wp.array2d(dtype=wp.float64),
+    to_ray_y: wp.array2d(dtype=wp.float64),
+):
+    """Adds the gradients of all that ``blend_corners`` reads to ``to_...``."""
+    b, y, x = wp.tid()
+    f = face[b, y, x]
+    if f >= 0:
+        v = faces[f]
+        ray = wp.vec3d(ray_x[b, x], ray_y[b, y], wp.float64(1.0))
+        hit = meet(points[b, v[0]], points[b, v[1]], points[b, v[2]], ray)
+        of_b1 = float(0.0)
+        of_b2 = float(0.0)
+        for c in range(attributes.shape[1]):
+            g = of_values[b, y, x, c]
+            of_b1 += wp.dot(g, attributes[v[1], c] - attributes[v[0], c])
+            of_b2 += wp.dot(g, attributes[v[2], c] - attributes[v[0], c])
+            wp.atomic_add(to_attributes, v[0], c, wp.float32(hit.b0) * g)
+            wp.atomic_add(to_attributes, v[1], c, wp.float32(hit.b1) * g)
+            wp.atomic_add(to_attributes, v[2], c, wp.float32(hit.b2) * g)
+        pull = wp.float64(of_b1) * hit.row1 + wp.float64(of_b2) * hit.row2 + wp.float64(of_depth[b, y, x]) * hit.row3
+        wp.atomic_sub(to_points, b, v[0], hit.b0 * pull)
+        wp.atomic_sub(to_points, b, v[1], hit.b1 * pull)
+        wp.atomic_sub(to_points, b, v[2], hit.b2 * pull)
+        wp.atomic_add(to_ray_x, b, x, hit.depth * pull[0])
+        wp.atomic_add(to_ray_y, b, y, hit.depth * pull[1])
+
+
+@wp.func
+def turned(p: wp.vec3d, axis: int):
+    """Screen position as (along, across) a row (axis 0) or a column (axis 1); the depth stays third."""
+    if axis == 0:
+        return p
+    return wp.vec3d(p[1], p[0], p[2])
+
+
+@wp.func
+def straddles(p: wp.vec3d, q: wp.vec3d, across: wp.float64):
+    """Half open, so that a chain of edges crosses a row once."""
+    return (p[1] <= across) != (q[1] <= across)
+
+
+@wp.func
+def crossing(p: wp.vec3d, q: wp.vec3d, along: wp.float64, across: wp.float64, way: wp.float64):
+    """How far in the way (+1 or -1) from the pixel centre (along, across) its row meets the line p, q."""
+    return (p[0] + (across - p[1]) / (q[1] - p[1]) * (q[0] - p[0]) - along) * way
+
+
+@wp.func
+def walk(
+    screen: wp.array2d(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    neighbours: wp.array(dtype=wp.vec3i),
+    b: int,
+    axis: int,
+    along: wp.float64,
+    across: wp.float64,
+    way: wp.float64,
+    start: int,
+    end: int,
+):
+    """Walks from the pixel centre (along, across) in face ``start`` over the surface to the next pixel's centre.
+
+    Returns the side (3 face + k) over which the surface ends or folds back before; -1 if it does not, or if the side
+    lies rather along the walk than across, and is left to the walks across.
+    """
+    v = faces[start]
+    f = int(start)
+    k = int(-1)
+    d = wp.float64(-1.0e30)
+    for i in range(3):
+        p = turned(screen[b, v[(i + 1) % 3]], axis)
+        q = turned(screen[b, v[(i + 2) % 3]], axis)
+        if straddles(p, q, across):
+            here = crossing(p, q, along, across, way)
+            if here > d:
+                d = here
+                k = i
+    if k < 0 or d < -SLACK:
+        return int(-1)
+    i_p = int(v[(k + 1) % 3])
+    i_q = int(v[(k + 2) % 3])
+    for _ in range(STEPS):
+        if d > wp.float64(1.0):
+            return int(-1)
+        p = turned(screen[b, i_p], axis)
+        q = turned(screen[b, i_q], axis)
+        g = neighbours[f][k]
+        ends = bool(g < 0)
+        if not ends:
+            if g == end:
+                return int(-1)
+            w = faces[g]
+            i_o = int(w[0])
+            if i_o == i_p or i_o == i_q:
+                i_o = w[1]
+            if i_o == i_p or i_o == i_q:
+                i_o = w[2]
+            o = turned(screen[b, i_o], axis)
+            i_left = int(i_p)  # the vertex that the walk leaves behind: not on the side by which it leaves g
+            if (o[1] <= across) == (p[1] <= across):
+                p = o
+                i_p = i_o
+            else:
+                q = o
+                i_left = i_q
+                i_q = i_o
+            there = crossing(p, q, along, across, way)
+            ends = o[2] <= wp.float64(0.0) or there < d - SLACK
+            if not ends:
+                d = there
+                f = g
+                k = 0
+                if w[1] == i_left:
+                    k = 1
+                if w[2] == i_left:
+                    k = 2
+        if ends:
+            v = faces[f]
+            p = turned(screen[b, v[(k + 1) % 3]], axis)
+            q = turned(screen[b, v[(k + 2) % 3]], axis)
+            if wp.abs(q[0] - p[0]) <= wp.abs(q[1] - p[1]):
+                return 3 * f + k
+            return int(-1)
+    return int(-1)
+
+
+@wp.kernel
+def find_steps(
+    screen: wp.array2d(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    neighbours: wp.array(dtype=wp.vec3i),
+    face: wp.array3d(dtype=wp.int32),
+    depth: wp.array3d(dtype=wp.float32),
+    steps: wp.array3d(dtype=wp.vec2i),
+):
+    """Between which pixels the surface ends: steps [B, H, W] for the pair of a pixel and its right / lower neighbour.
+
+    A step is 2 (3 face + k) of the side in between, plus 1 if the neighbour is the nearer one; -1 without.
+    """
+    b, y, x = wp.tid()
+    found = wp.vec2i(-1, -1)
+    here = face[b, y, x]
+    for axis in range(2):
+        x_next = x + 1 - axis
+        y_next = y + axis
+        if x_next < face.shape[2] and y_next < face.shape[1]:
+            there = face[b, y_next, x_next]
+            if here != there:
+                swap = int(0)
+                if here < 0 or (there >= 0 and depth[b, y_next, x_next] < depth[b, y, x]):
+                    swap = 1
+                along = wp.float64(x) + wp.float64(0.5)
+                across = wp.float64(y) + wp.float64(0.5)
+                if axis == 1:
+                    along = wp.float64(y) + wp.float64(0.5)
+                    across = wp.float64(x) + wp.float64(0.5)
+                s = int(-1)
+                if swap == 0:
+                    s = walk(screen, faces, neighbours, b, axis, along, across, wp.float64(1.0), here, there)
+                else:
+                    along += wp.float64(1.0)
+                    s = walk(screen, faces, neighbours, b, axis, along, across, wp.float64(-1.0), there, here)
+                if s >= 0:
+                    found[axis] = 2 * s + swap
+    steps[b, y, x] = found
+
+
+@wp.struct
+class Step:
+    """A step read back: the two pixels, the side's vertices, and where between the pixels it lies.
+
+    The surface ends ``0.5 + weight`` pixels after the nearer pixel's centre, at the share t from vertex i to j.
+    """
+
+    near_x: int
+    near_y: int
+    far_x: int
+    far_y: int
+    i: int
+    j: int
+    t: wp.float64
+    slope: wp.float64
+    way: wp.float64
+    weight: wp.float64
+
+
+@wp.func
+def read_step(screen: wp.array2d(dtype=wp.vec3d), faces: wp.array(dtype=wp.vec3i), code: int, b: int, y: int, x: int,
+              axis: int):  # fmt: skip
+    s = Step()
+    swap = code % 2
+    k = (code / 2) % 3
+    v = faces[code / 6]
+    s.i = v[(k + 1) % 3]
+    s.j = v[(k + 2) % 3]
+    right = 1 - axis
+    s.near_x = x + swap * right
+    s.near_y = y + swap * axis
+    s.far_x = x + (1 - swap) * right
+    s.far_y = y + (1 - swap) * axis
+    s.way = wp.float64(1 - 2 * swap)
+    p = turned(screen[b, s.i], axis)
+    q = turned(screen[b, s.j], axis)
+    centre = turned(wp.vec3d(wp.float64(s.near_x) + wp.float64(0.5), wp.float64(s.near_y) + wp.float64(0.5),
+                             wp.float64(0.0)), axis)  # fmt: skip
+    s.t = (centre[1] - p[1]) / (q[1] - p[1])
+    s.slope = (q[0] - p[0]) / (q[1] - p[1])
+    s.weight = (p[0] + s.t * (q[0] - p[0]) - centre[0]) * s.way - wp.float64(0.5)
+    return s
+
+
+@wp.kernel
+def soften(
+    screen: wp.array2d(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    steps: wp.array3d(dtype=wp.vec2i),
+    values: wp.array4d(dtype=wp.vec4),
+    softened: wp.array4d(dtype=wp.vec4),
+):
+    """Gives the pixel in which the side lies its share of the other one's values; ``softened`` equals values before."""
+    b, y, x = wp.tid()
+    for axis in range(2):
+        code = steps[b, y, x][axis]
+        if code >= 0:
+            s = read_step(screen, faces, code, b, y, x, axis)
+            weight = wp.float32(s.weight)
+            for c in range(values.shape[3]):
+                change = weight * (values[b, s.near_y, s.near_x, c] - values[b, s.far_y, s.far_x, c])
+                if weight > 0.0:
+                    wp.atomic_add(softened, b, s.far_y, s.far_x, c, change)
+                else:
+                    wp.atomic_add(softened, b, s.near_y, s.near_x, c, change)
+
+
+@wp.kernel
+def soften_backward(
+    screen: wp.array2d(dtype=wp.vec3d),
+    faces: wp.array(dtype=wp.vec3i),
+    steps: wp.array3d(dtype=wp.vec2i),
+    values: wp.array4d(dtype=wp.vec4),
+    of_softened: wp.array4d(dtype=wp.vec4),
+    to_values: wp.array4d(dtype=wp.vec4),
+    to_screen: wp.array2d(dtype=wp.vec3d),
+):
+    """Adds the gradients to ``to_...``; ``to_values`` equals of_softened before."""
+    b, y, x = wp.tid()
+    for axis in range(2):
+        code = steps[b, y, x][axis]
+        if code >= 0:
+            s = read_step(screen, faces, code, b, y, x, axis)
+            weight = wp.float32(s.weight)
+            of_weight = float(0.0)
+            for c in range(values.shape[3]):
+                g = of_softened[b, s.near_y, s.near_x, c]
+                if weight > 0.0:
+                    g = of_softened[b, s.far_y, s.far_x, c]
+                of_weight += wp.dot(g, values[b, s.near_y, s.near_x, c] - values[b, s.far_y, s.far_x, c])
+                wp.atomic_add(to_values, b, s.near_y, s.near_x, c, weight * g)
+                wp.atomic_sub(to_values, b, s.far_y, s.far_x, c, weight * g)
+            pull = wp.float64(of_weight) * s.way * turned(wp.vec3d(wp.float64(1.0), -s.slope, wp.float64(0.0)), axis)
+            wp.atomic_add(to_screen, b, s.i, (wp.float64(1.0) - s.t) * pull)
+            wp.atomic_add(to_screen, b, s.j, s.t * pull)
