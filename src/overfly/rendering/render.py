@@ -125,17 +125,17 @@ def _check(
     vertices: Tensor, colors: Tensor, topology: Topology, views: Views, background: Tensor | None,
     attributes: Tensor | None,
 ) -> None:  # fmt: skip
-    if vertices.shape != (topology.count, 3):
+    if vertices.shape != (topology.vertex_count, 3):
         raise InputError(
-            f"Vertices have the shape {tuple(vertices.shape)}: give ({topology.count}, 3), as the topology has it."
+            f"Vertices have the shape {tuple(vertices.shape)}: give ({topology.vertex_count}, 3), as in the topology."
         )
-    if colors.dim() != 2 or len(colors) != topology.count or not 1 <= colors.shape[1] <= 3:
+    if colors.dim() != 2 or len(colors) != topology.vertex_count or not 1 <= colors.shape[1] <= 3:
         raise InputError(
-            f"Colours have the shape {tuple(colors.shape)}: give ({topology.count}, C) with C of 1 to 3, and further "
-            "values as attributes."
+            f"Colours have the shape {tuple(colors.shape)}: give ({topology.vertex_count}, C) with C of 1 to 3, "
+            "and further values as attributes."
         )
-    if attributes is not None and (attributes.dim() != 2 or len(attributes) != topology.count):
-        raise InputError(f"Attributes have the shape {tuple(attributes.shape)}: give ({topology.count}, A).")
+    if attributes is not None and (attributes.dim() != 2 or len(attributes) != topology.vertex_count):
+        raise InputError(f"Attributes have the shape {tuple(attributes.shape)}: give ({topology.vertex_count}, A).")
     b = len(views.camera_from_world)
     if views.camera_from_world.shape[1:] != (4, 4) or views.intrinsics.shape != (b, 3, 3):
         raise InputError(

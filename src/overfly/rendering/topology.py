@@ -22,18 +22,20 @@ class Topology(NamedTuple):
         neighbours: [F, 3] int32, the face across side k; -1 without one.
         edges: [E, 2] int64, every edge once, lower vertex index first.
         pairs: [P, 2] int64, the two faces of every edge that has two.
-        count: number of vertices.
+        vertex_count: V.
     """
 
     faces: Tensor
     neighbours: Tensor
     edges: Tensor
     pairs: Tensor
-    count: int
+    vertex_count: int
 
     def to(self, device: torch.device | str) -> Topology:
         """The same on another device."""
-        return Topology(*(part.to(device) for part in self[:4]), self.count)
+        parts = (self.faces, self.neighbours, self.edges, self.pairs)
+        faces, neighbours, edges, pairs = (part.to(device) for part in parts)
+        return Topology(faces, neighbours, edges, pairs, self.vertex_count)
 
 
 def topology(faces: NDArray[np.integer] | Tensor, count_of_vertices: int) -> Topology:
@@ -73,10 +75,14 @@ def topology(faces: NDArray[np.integer] | Tensor, count_of_vertices: int) -> Top
     one, other = side[shared], side[shared + 1]
     neighbours = np.full(3 * len(corners), -1, np.int32)
     neighbours[one], neighbours[other] = other // 3, one // 3
-    parts = (
-        corners.astype(np.int32),
-        neighbours.reshape(-1, 3),
-        np.stack(np.divmod(key[first], max(count_of_vertices, 1)), axis=1),
-        np.stack([one, other], axis=1) // 3,
+
+    def put(array: NDArray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+
+    return Topology(
+        faces=put(corners.astype(np.int32)),
+        neighbours=put(neighbours.reshape(-1, 3)),
+        edges=put(np.stack(np.divmod(key[first], max(count_of_vertices, 1)), axis=1)),
+        pairs=put(np.stack([one, other], axis=1) // 3),
+        vertex_count=count_of_vertices,
     )
-    return Topology(*(torch.from_numpy(np.ascontiguousarray(part)).to(device) for part in parts), count_of_vertices)
