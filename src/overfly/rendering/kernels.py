@@ -154,11 +154,11 @@ def blend_corners(
         v = faces[f]
         ray = wp.vec3d(ray_x[b, x], ray_y[b, y], wp.float64(1.0))
         hit = meet(points[b, v[0]], points[b, v[1]], points[b, v[2]], ray)
-        b0 = wp.float32(hit.b0)
         b1 = wp.float32(hit.b1)
         b2 = wp.float32(hit.b2)
         for c in range(attributes.shape[1]):
-            values[b, y, x, c] = b0 * attributes[v[0], c] + b1 * attributes[v[1], c] + b2 * attributes[v[2], c]
+            first = attributes[v[0], c]  # in this form a constant stays exactly what it is
+            values[b, y, x, c] = first + b1 * (attributes[v[1], c] - first) + b2 * (attributes[v[2], c] - first)
         depth[b, y, x] = wp.float32(hit.depth)
 
 

@@ -155,7 +155,8 @@ def _warp(x: Tensor, kind: str | None = None) -> Any:
     """A tensor as an array of warp, without a copy; ``kind``: the vector that its last dimension is."""
     import warp as wp
 
-    return wp.from_torch(x.detach(), dtype=getattr(wp, kind) if kind else None, requires_grad=False)
+    x = x.detach() if x.numel() else torch.zeros(x.shape, dtype=x.dtype, device=x.device)  # with plain strides
+    return wp.from_torch(x, dtype=getattr(wp, kind) if kind else None, requires_grad=False)
 
 
 def _quads(x: Tensor) -> Any:

@@ -44,7 +44,7 @@ def render(
         behind = background[:, None, None] if background.dim() == 1 else background
         image = image + (1 - coverage[:, None]) * behind
     further = None if attributes is None else values[..., channels + 1 :].permute(0, 3, 1, 2)
-    return Rendered(image, coverage, depth, face, further)
+    return Rendered(image, coverage.clamp(0, 1), depth, face, further)
 
 
 def rasterise(screen: Tensor, faces: Tensor, size: tuple[int, int]) -> Tensor:
@@ -97,8 +97,8 @@ def interpolate(
     h, g = torch.linalg.cross(ray, e2), torch.linalg.cross(-p0, e1)
     det = (e1 * h).sum(1)
     b1, b2, z = -(p0 * h).sum(1) / det, (ray * g).sum(1) / det, (e2 * g).sum(1) / det
-    weights = torch.stack([1 - b1 - b2, b1, b2], 1)
-    found = (weights[..., None] * attributes[corners]).sum(1)
+    a0, a1, a2 = (attributes[corners[:, i]] for i in range(3))
+    found = a0 + b1[:, None] * (a1 - a0) + b2[:, None] * (a2 - a0)
     values = found.new_zeros(*face.shape, attributes.shape[1]).index_put((b, y, x), found)
     return values, found.new_zeros(face.shape).index_put((b, y, x), z)
 

@@ -34,7 +34,7 @@ class Rendered(NamedTuple):
 
     Attributes:
         image: [B, C, H, W] colours over the background (black without one), soft at silhouettes.
-        coverage: [B, H, W] the mesh's share of the pixel, 0 to 1, soft at silhouettes.
+        coverage: [B, H, W] the mesh's share of the pixel, 0 to 1, soft at silhouettes (of parts wider than a pixel).
         depth: [B, H, W] camera z at the pixel's centre in units of the vertices; 0 where nothing is.
         face: [B, H, W] int32, the face at the pixel's centre; -1 where nothing is.
         attributes: [B, A, H, W] at the pixel's centre, 0 where nothing is; None if none were given.
@@ -92,7 +92,7 @@ def render(
     image, coverage, *_ = planes.split([channels, 1, *[1] * (3 - channels)], 1)
     if background is not None:
         image = image + (1 - coverage) * (background[:, None, None] if background.dim() == 1 else background)
-    return Rendered(image, coverage[:, 0], depth, face, further)
+    return Rendered(image, coverage[:, 0].clamp(0, 1), depth, face, further)
 
 
 def project(vertices: Tensor, views: Views, near: float = NEAR) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
