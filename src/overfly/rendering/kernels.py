@@ -316,12 +316,15 @@ def find_steps(
     b, y, x = wp.tid()
     found = wp.vec2i(-1, -1)
     here = face[b, y, x]
+    beside = wp.vec3i(-1, -1, -1)  # faces that the surface reaches without an end, if they are seen there
+    if here >= 0:
+        beside = neighbours[here]
     for axis in range(2):
         x_next = x + 1 - axis
         y_next = y + axis
         if x_next < face.shape[2] and y_next < face.shape[1]:
             there = face[b, y_next, x_next]
-            if here != there:
+            if here != there and (there < 0 or (there != beside[0] and there != beside[1] and there != beside[2])):
                 swap = int(0)
                 if here < 0 or (there >= 0 and depth[b, y_next, x_next] < depth[b, y, x]):
                     swap = 1

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from overfly.rendering.topology import Topology
 from overfly.scenes.device import start
@@ -103,6 +104,7 @@ class _Interpolate(torch.autograd.Function):
         return values, depth
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         from overfly.rendering.kernels import blend_corners_backward
 
@@ -139,6 +141,7 @@ class _Antialias(torch.autograd.Function):
         return softened
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         from overfly.rendering.kernels import soften_backward
 
