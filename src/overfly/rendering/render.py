@@ -62,9 +62,10 @@ def render(
     Gradients of image and coverage reach the vertices both inside of faces (perspective-correct interpolation) and at
     silhouettes, also where one part hides another (antialiased edges after Laine et al. 2020, "Modular Primitives for
     High-Performance Differentiable Rendering"); those of depth and attributes reach them inside of faces. All of them
-    reach colours, attributes, background and cameras, too. Silhouettes' gradients follow the derivative of a box-filtered
-    image to some 5 % (a rigid motion of a solid of 20 pixels); less truly where colours jump from pixel to pixel. Where two surfaces cut through each other without a common
-    edge, the gradient does not know that the cut moves. Faces are drawn from both sides and without shading.
+    reach colours, attributes, background and cameras, too. At silhouettes they follow the derivative of a box-filtered
+    image to some 5 % where colours change slowly, less truly where they jump from pixel to pixel. Where two surfaces
+    cut through each other without a common edge, the gradient does not know that the cut moves. Faces are drawn from
+    both sides and without shading. There are no second derivatives.
 
     A face of which a vertex is nearer than ``near``, or behind the camera, is dropped as a whole, not clipped.
 
