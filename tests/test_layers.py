@@ -13,7 +13,7 @@ ORDER = [
     ["__init__", "errors", "tables"],
     ["geometry", "geodesy"],
     ["ply", "files", "cloud", "mesh"],
-    ["losses", "metrics"],
+    ["losses", "image_losses", "mesh_losses", "metrics"],
     ["scenes"],
     ["rendering"],
     ["flights"],
@@ -22,8 +22,9 @@ ORDER = [
     ["stages"],
     ["callbacks"],
     ["mapping"],
+    ["refinement"],
     ["evaluation"],
-    ["configuration", "summary", "run_folder", "run", "evaluate", "shipped"],
+    ["configuration", "summary", "run_folder", "run", "evaluate", "shipped", "refine"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

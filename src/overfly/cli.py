@@ -119,6 +119,42 @@ def map_(
 
 
 @app.command()
+def refine(
+    flight: Annotated[Path, typer.Argument(help="A flight folder, or any folder of drone photos.")],
+    out: Annotated[Path, typer.Option(help="Where the refined mesh, pictures and figures go.")],
+    mesh: Annotated[
+        Path | None, typer.Option(help="A rough mesh in the frame of the flight's cameras. Default: made by stereo.")
+    ] = None,
+    generator: Annotated[str, typer.Option(help="vertices (each is free) or network (over them).")] = "vertices",
+    width: Annotated[int, typer.Option(help="At which photographs are compared, pixels.")] = 1024,
+    faces: Annotated[int, typer.Option(help="Of the refined mesh, about.")] = 200_000,
+    hold_out: Annotated[int, typer.Option(help="Every so manieth photograph is only measured on; 0: none.")] = 6,
+    adversarial: Annotated[
+        float | None, typer.Option("--lambda", help="Weight of the critic; 0: none. Default: as in conf/loss.")
+    ] = None,
+    cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another refinement in --out.")] = False,
+) -> None:
+    """Refine a rough mesh until its renderings look like the photographs (SS-GAN-3D)."""
+    from overfly.refine import refine as run
+
+    raise SystemExit(
+        run(
+            flight,
+            out=out,
+            mesh=mesh,
+            generator=generator,
+            width=width,
+            faces=faces,
+            hold_out=hold_out,
+            adversarial=adversarial,
+            cameras=cameras,
+            overwrite=overwrite,
+        )
+    )
+
+
+@app.command()
 def evaluate(
     cloud: Annotated[Path, typer.Argument(help="The cloud to judge: .ply, .las or .laz.")],
     reference: Annotated[Path, typer.Argument(help="The true cloud.")],

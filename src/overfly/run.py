@@ -174,6 +174,8 @@ def _best(trainer: Any, monitor: str, metrics: dict[str, float]) -> tuple[str | 
 
 def warm_start(stage: Any, name: str, from_run: str | None) -> list[str]:
     """Start ``stage`` from another run's weights; one line for every part says where its weights came from."""
+    if from_run is None and name == "ssgan3d":
+        return ["ssgan3d: the mesh starts as the rough one, the critic at random (seeded)"]
     if from_run is None:
         more = "" if name == "encoder" else f"; from_run=outputs/encoder/... starts {name} from a trained encoder"
         return [f"{name}: every weight starts at random (seeded){more}"]

@@ -92,7 +92,7 @@ class Pictures(L.Callback):
             image = batch["images"][i, 0].permute(1, 2, 0).cpu().numpy()
             title = f"validation window {i}, epoch {trainer.current_epoch + 1}"
             plot_clouds(batch["reference"][i].cpu().numpy() * scale, predicted * scale, image, path, title)
-            _hand_over(trainer, f"val/cloud_{i}", path)
+            hand_over(trainer, f"val/cloud_{i}", path)
 
 
 class Predictions(L.Callback):
@@ -140,7 +140,7 @@ def predicted_points(stage: L.LightningModule, batch: Batch) -> NDArray[np.float
     return np.asarray(points.float().cpu().numpy())
 
 
-def _hand_over(trainer: L.Trainer, name: str, path: Path) -> None:
+def hand_over(trainer: L.Trainer, name: str, path: Path) -> None:
     """Show a picture in those loggers that take pictures."""
     for logger in trainer.loggers:
         kind = type(logger).__name__

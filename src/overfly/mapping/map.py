@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,29 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
     Raises:
         InputError: the flight cannot be mapped, or ``out`` belongs to another one.
     """
+    flight, steps, identity, asked = _opened(flight_folder, out, settings)
+    with _told_when_stopped(steps):
+        block, local = _measured(flight, identity, asked, steps)
+        return deliver(flight, block, local, Path(out), asked, steps)
+
+
+def align_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> tuple[Flight, Block]:
+    """The flight and its cameras, given or estimated, and nothing dense; arguments as :func:`map_flight`."""
+    flight, steps, identity, asked = _opened(flight_folder, out, settings)
+    with _told_when_stopped(steps):
+        return flight, _aligned(flight, identity, asked, steps)[0]
+
+
+def measure_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> tuple[Flight, Block, Cloud]:
+    """The flight, its cameras and the dense cloud in their frame, without products; arguments as :func:`map_flight`."""
+    flight, steps, identity, asked = _opened(flight_folder, out, settings)
+    with _told_when_stopped(steps):
+        return flight, *_measured(flight, identity, asked, steps)
+
+
+def _opened(
+    flight_folder: Path | str, out: Path | str, settings: dict[str, Any]
+) -> tuple[Flight, Steps, str, MapSettings]:
     asked = MapSettings(**settings)
     flight_folder, out = Path(flight_folder), Path(out)
     start = time.perf_counter()
@@ -43,10 +67,15 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
     work = claim(out, flight_folder, identity, overwrite=asked.overwrite)
     steps = Steps(work, resume=asked.resume, show=asked.progress)
     steps.seconds["images"] = round(time.perf_counter() - start, 2)
+    return flight, steps, identity, asked
+
+
+@contextmanager
+def _told_when_stopped(steps: Steps) -> Iterator[None]:
     try:
-        return _map(flight, identity, out, asked, steps)
+        yield
     except KeyboardInterrupt:
-        kept = sorted({p.name.rsplit("-", 1)[0] for p in work.iterdir() if p.is_dir() and p.suffix == ""})
+        kept = sorted({p.name.rsplit("-", 1)[0] for p in steps.folder.iterdir() if p.is_dir() and p.suffix == ""})
         steps.say(
             "stopped",
             f"during {steps.running or 'the start'}; kept: {', '.join(kept) or 'nothing yet'}. "
@@ -55,11 +84,11 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
         raise
 
 
-def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: Steps) -> dict[str, Any]:
+def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, str]:
+    """The block and the key of everything it depends on."""
     estimate = asked.cameras == "estimate" or (asked.cameras == "auto" and flight.cameras_from is None)
     steps.say("images", _about(flight))
-    network = None if asked.network is None else _network_key(asked)
-    matched = [asked.seed, *([] if asked.matcher == "sift" else [asked.matcher, network])]
+    matched = [asked.seed, *([] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)])]
     key = key_of(__version__, identity, estimate, matched if estimate else None)
     block = steps.kept(
         "cameras",
@@ -69,15 +98,20 @@ def _map(flight: Flight, identity: str, out: Path, asked: MapSettings, steps: St
         lambda folder: read_block(folder, flight),
     )
     steps.say("cameras", _about_block(block, flight))
+    return block, key
+
+
+def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, Cloud]:
+    block, key = _aligned(flight, identity, asked, steps)
     check_memory(block, asked)
-    key = key_of(key, asked.dense, network if asked.dense == "sweep" else None, asked.seed)
+    key = key_of(key, asked.dense, _network_key(asked) if asked.dense == "sweep" else None, asked.seed)
     make: Callable[[Path], Cloud] = {
         "sweep": lambda scratch: sweep_cloud(block, flight, scratch, asked, steps),
         "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
     }[asked.dense]
     local = steps.kept("dense", key, make, keep_cloud, kept_cloud)
     steps.say("dense", f"{count_text(len(local))} points by {_how(asked)}")
-    return deliver(flight, block, local, out, asked, steps)
+    return block, local
 
 
 def check_memory(block: Block, asked: MapSettings) -> None:

@@ -21,15 +21,24 @@ Batch = dict[str, Tensor]
 OptimizerFactory = Callable[..., torch.optim.Optimizer]
 
 TERMS = (
-    "chamfer", "emd", "adversarial", "adversarial_eq1", "correspondence", "retrieval", "correction",
+    "chamfer", "emd", "adversarial", "adversarial_eq1", "correspondence", "matching", "retrieval", "correction",
     "height", "hypotheses", "sigma", "confidence",
 )  # fmt: skip
-"""The weights of conf/loss; each is named like its function in :mod:`overfly.losses`."""
+"""The weights of conf/loss; each is named like its function in :mod:`overfly.losses`.
+
+``matching`` is ``correspondence`` of the match map, where a sweep compares another map.
+"""
 
 TEST_SPLITS = ("test", "unseen")
 """Scenes of the styles that were trained on, and of other styles."""
 
 PARTS = ("encoder", "generator", "discriminator")
+
+
+def step_random(seed: int, epoch: int, batch_idx: int, rank: int) -> torch.Generator:
+    """The generator of everything that is drawn in one step of one process."""
+    state = np.random.SeedSequence((seed, epoch, batch_idx, rank)).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
 
 class Stage(L.LightningModule):
@@ -89,8 +98,7 @@ class Stage(L.LightningModule):
     def random(self, batch_idx: int, *, epoch: int | None = None) -> torch.Generator:
         """The generator of everything that is drawn in one step."""
         epoch = self.current_epoch if epoch is None else epoch
-        state = np.random.SeedSequence((self.seed, epoch, batch_idx, self.global_rank)).generate_state(1, np.uint64)
-        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+        return step_random(self.seed, epoch, batch_idx, self.global_rank)
 
     def optimise(
         self, optimizer: Any, loss: Tensor, batch_idx: int, parts: Iterable[str], retain_graph: bool = False

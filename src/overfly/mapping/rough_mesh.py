@@ -1,0 +1,98 @@
+"""The rough mesh: a dense cloud as a triangulated height field, with colours, within a budget of faces.
+
+Steep faces stand where walls are: their vertices are free to move in all three directions afterwards.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.cloud import Cloud
+from overfly.errors import InputError
+from overfly.mapping.raster import Grid, grid_over, surface
+from overfly.mesh import Mesh
+
+FILL = 12
+"""Cells from the nearest measured one up to which gaps are closed."""
+
+PARTS = 4
+"""Parts of a cell along each side, of which the one with the median height is taken."""
+
+TRIM = 0.001
+"""Share of the points left out on each side of the grid: single stray points."""
+
+
+def rough_mesh(cloud: Cloud, *, faces: int) -> Mesh:
+    """Triangulate the upper surface of a cloud.
+
+    Args:
+        cloud: N points, z up.
+        faces: about so many triangles; at most 5 % more.
+
+    Returns:
+        One connected height field or several, counter-clockwise seen from above, with the cloud's colours if it has
+        any. Vertices stand in the middle of grid cells; each has a face.
+
+    Raises:
+        InputError: fewer than 8 faces are asked for, or the cloud covers too little for a mesh.
+    """
+    if faces < 8:
+        raise InputError(f"A mesh of {faces} faces shows no landscape: ask for 1000 or more.")
+    if len(cloud) < 8:
+        raise InputError(f"{len(cloud)} points are too few for a mesh: give a dense cloud.")
+    extent = np.ptp(cloud.points[:, :2], axis=0)
+    cell = float(np.sqrt(max(2 * extent[0] * extent[1], 1e-12) / faces))
+    mesh = _triangulated(cloud, grid_over(cloud.points, cell, trim=TRIM))
+    for _ in range(4):  # the covered share of the grid depends a little on its cells
+        if not len(mesh.faces) or 0.9 * faces <= len(mesh.faces) <= 1.05 * faces:
+            break
+        cell *= float(np.sqrt(len(mesh.faces) / (0.98 * faces)))
+        mesh = _triangulated(cloud, grid_over(cloud.points, cell, trim=TRIM))
+    if not len(mesh.faces):
+        raise InputError("The cloud covers no connected ground: a mesh needs points that lie beside each other.")
+    return mesh
+
+
+def _triangulated(cloud: Cloud, grid: Grid) -> Mesh:
+    heights, colors = _medians(cloud, grid)
+    known = np.isfinite(heights)
+    quads = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
+    row, column = np.nonzero(quads)
+    north_west = row * grid.columns + column
+    corners = np.stack([north_west, north_west + grid.columns, north_west + grid.columns + 1, north_west + 1], axis=1)
+    z = heights.ravel()[corners]
+    # The diagonal between the two corners that are nearer in height follows edges of roofs instead of cutting them.
+    falling = np.abs(z[:, 0] - z[:, 2]) <= np.abs(z[:, 1] - z[:, 3])
+    triangles = np.concatenate(
+        [
+            corners[falling][:, [0, 1, 2]],
+            corners[falling][:, [0, 2, 3]],
+            corners[~falling][:, [0, 1, 3]],
+            corners[~falling][:, [1, 2, 3]],
+        ]
+    )
+    used, faces = np.unique(triangles, return_inverse=True)
+    xy = grid.centres().reshape(-1, 2)[used]
+    vertices = np.column_stack([xy, heights.ravel()[used]])
+    return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32), None if colors is None else colors[used])
+
+
+def _medians(cloud: Cloud, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
+    """Height [rows, columns] (NaN where unknown) and colour [cells, 3]: those of the part with the median height.
+
+    A mean over a cell that is half roof and half street would be neither.
+    """
+    fine = Grid(grid.x_min, grid.y_max, grid.cell / PARTS, grid.rows * PARTS, grid.columns * PARTS)
+    seen = surface(cloud, fine, fill=FILL * PARTS)
+
+    def parts(values: NDArray) -> NDArray:
+        blocks = values.reshape(grid.rows, PARTS, grid.columns, PARTS, -1).swapaxes(1, 2)
+        return np.asarray(blocks.reshape(grid.rows * grid.columns, PARTS**2, -1))
+
+    heights = parts(seen.heights)[..., 0]
+    order, known = heights.argsort(axis=1), np.isfinite(heights).sum(1)  # NaN last
+    cell = np.arange(len(heights))
+    middle = order[cell, np.maximum(known - 1, 0) // 2]
+    colors = None if seen.colors is None else parts(seen.colors)[cell, middle]
+    return np.where(known > 0, heights[cell, middle], np.nan).reshape(grid.rows, grid.columns), colors

@@ -1,0 +1,93 @@
+"""``overfly refine``: stage=ssgan3d on a user's flight, in one folder that can be gone on with."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from overfly.errors import InputError, unknown
+
+GENERATORS = {"vertices": "free_vertices", "network": "mesh_generator"}
+
+
+def refine(
+    flight: Path,
+    *,
+    out: Path,
+    mesh: Path | None = None,
+    generator: str = "vertices",
+    width: int = 1024,
+    faces: int = 200_000,
+    hold_out: int = 6,
+    adversarial: float | None = None,
+    cameras: str = "auto",
+    overwrite: bool = False,
+    more: Sequence[str] = (),
+) -> int:
+    """Refine the mesh of a flight; returns the exit code.
+
+    The same command in the same folder goes on where it was stopped.
+
+    Args:
+        flight: a flight folder or a folder of photographs.
+        out: the run folder; gets start.ply, refined.ply, pictures and metrics.json.
+        mesh: rough mesh in the frame of the cameras; None: stereo makes one.
+        generator: "vertices" or "network".
+        width: of the photographs, pixels.
+        faces: of the refined mesh, about.
+        hold_out: every so manieth photograph is only measured on.
+        adversarial: the paper's lambda; None: as configured.
+        cameras: auto, given or estimate.
+        overwrite: replace another refinement in ``out``.
+        more: further overrides of the configuration.
+
+    Raises:
+        InputError: a value is impossible, or ``out`` holds another refinement.
+    """
+    from overfly.run import main
+
+    if generator not in GENERATORS:
+        raise unknown("--generator", generator, sorted(GENERATORS))
+    if not flight.is_dir():
+        raise InputError(f"There is no folder {flight}: give a flight folder or a folder of photographs.")
+    if faces < 1000:
+        raise InputError(f"--faces {faces} is too few to show a landscape: give 1000 or more.")
+    rough = min(faces, 20_000)
+    steps = [(rough, 2), (max(rough, faces // 3), 1), (faces, 1)]
+    levels = ",".join(f"{{faces:{count},shrink:{shrink}}}" for count, shrink in steps)
+    asked = [
+        "stage=ssgan3d",
+        f"model={GENERATORS[generator]}",
+        f"data.flight={_quoted(flight.resolve())}",
+        f"data.mesh={'null' if mesh is None else _quoted(mesh.resolve())}",
+        f"data.faces={rough}",
+        f"data.width={width}",
+        f"data.hold_out={hold_out}",
+        f"data.cameras={cameras}",
+        f"stage.levels=[{levels}]",
+        *([] if adversarial is None else [f"loss.adversarial={adversarial}"]),
+        *more,
+    ]
+    recorded = out / "overrides.txt"
+    if recorded.is_file():
+        before = [line for line in recorded.read_text().splitlines() if line and not line.startswith(_OWN)]
+        if before == asked:
+            return main([f"resume={out}"])
+        if not overwrite:
+            raise InputError(
+                f"{out} holds another refinement (other photographs or settings): give another --out, or --overwrite."
+            )
+        shutil.rmtree(out)
+    elif out.is_dir() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty and holds no refinement: give a new folder as --out.")
+    return main([*asked, f"hydra.run.dir={_quoted(out)}"])
+
+
+_OWN = ("hydra.run.dir=", "resume=")
+
+
+def _quoted(path: Path) -> str:
+    """A path as a value of an override, whatever characters it has."""
+    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{text}'"
