@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from typing import Any, NamedTuple, Protocol, cast
 
 import lightning as L
@@ -27,6 +27,9 @@ WEIGHTS = (
     "alpha", "beta", "gamma", "centre", "slope", "adversarial", "theta",
     "consistency", "laplacian", "normal_consistency", "edge_length",
 )  # fmt: skip
+
+PATIENCE = 3
+"""Epochs in which the overall loss must not have fallen any more, to have converged."""
 
 COVERED = 0.999
 """Antialiased coverage above which a pixel counts as shown by the mesh alone."""
@@ -53,6 +56,7 @@ class Shots(Protocol):
 
     mesh: Mesh
     gsd: float
+    photographs: Sized
 
 
 class SsGan3dStage(L.LightningModule):
@@ -66,7 +70,7 @@ class SsGan3dStage(L.LightningModule):
 
     The epochs are shared equally among the levels. Each level starts by halving edges where the images differ most,
     until the mesh has the level's ``faces``, and compares images reduced ``shrink`` times. In the last level training
-    stops as soon as the overall loss is below ``threshold`` and fell by less than ``tolerance`` of itself in an epoch.
+    stops as soon as the overall loss is below ``threshold`` and fell by less than ``tolerance`` of itself in the last epochs.
 
     Args:
         generator: makes the generator from vertices, colours and ``step`` (``_partial_: true`` in the YAML).
@@ -126,6 +130,7 @@ class SsGan3dStage(L.LightningModule):
         self.seed, self.level = seed, 0
         self.generator: nn.Module | None = None
         self.register_buffer("faces", torch.zeros(0, 3, dtype=torch.int32))
+        self.register_buffer("log_gains", torch.zeros(0, 3))
         self.sides: Topology | None = None
         self.edge_m = 1.0
         self.error: np.ndarray | None = None
@@ -143,6 +148,7 @@ class SsGan3dStage(L.LightningModule):
             colors = torch.from_numpy(np.asarray(data.mesh.colors)).float() / 255
             self.generator = self.make_generator(vertices, colors, step=self.step_gsd * data.gsd).to(self.device)
             self._connect(torch.from_numpy(np.asarray(data.mesh.faces)).int())
+            self.log_gains = torch.zeros(len(data.photographs), 3, device=self.device)
             self.gsd = float(data.gsd)
 
     def mesh(self) -> tuple[Tensor, Tensor]:
@@ -257,9 +263,10 @@ class SsGan3dStage(L.LightningModule):
     def on_train_epoch_end(self) -> None:
         """Stop where the overall loss has converged under the threshold (section 3.2)."""
         self.overall.append(self.sums[0] / max(self.sums[1], 1))
-        if self.level + 1 < len(self.levels) or len(self.overall) < 2 or not self.tolerance:
+        inside = len(self.overall) - self.level * self.epochs // len(self.levels)  # epochs of this level
+        if self.level + 1 < len(self.levels) or inside <= PATIENCE or not self.tolerance:
             return
-        before, now = self.overall[-2:]
+        before, now = min(self.overall[-inside:-PATIENCE]), min(self.overall[-PATIENCE:])
         low = self.threshold is None or now < self.threshold
         if low and before - now < self.tolerance * abs(before):
             limit = "" if self.threshold is None else f" under the threshold of {self.threshold:g}"
@@ -277,7 +284,7 @@ class SsGan3dStage(L.LightningModule):
             image = avg_pool2d(image, shrink)
             valid = (avg_pool2d(valid[:, None], shrink)[:, 0] > COVERED).float()
             intrinsics = intrinsics / torch.tensor([shrink, shrink, 1.0], device=intrinsics.device)[:, None]
-        shot = {"image": image, "valid": valid}
+        shot = {"image": image, "valid": valid, "index": batch["index"]}
         if not other and "other_image" in batch:
             shot["other"], near = self._shot(batch, "other_")  # type: ignore[assignment]
             shot["near"] = near  # type: ignore[assignment]
@@ -309,9 +316,20 @@ class SsGan3dStage(L.LightningModule):
     def _image_terms(self, rendered: Rendered, shot: Mapping[str, Tensor], mask: Tensor) -> dict[str, Tensor]:
         image = rendered.image
         if self.exposure:
-            image = image * image_losses.gains(image, shot["image"], mask).detach()[:, :, None, None]
+            image = image * self._exposures(image.detach(), shot, mask)[:, :, None, None]
         options = {name: self.weights[name] for name in ("alpha", "beta", "gamma", "centre", "slope")}
         return {"reconstruction": image_losses.reconstruction(image, shot["image"], mask=mask, **options).mean()}
+
+    @torch.no_grad()
+    def _exposures(self, image: Tensor, shot: Mapping[str, Tensor], mask: Tensor) -> Tensor:
+        """Gains [B, 3] of the photographs, smoothed over the steps; their mean over all photographs stays 1.
+
+        With a gain of its own for each step the colours would be free to drift: whatever is too dark would be lit.
+        """
+        index = shot["index"]
+        found = image_losses.gains(image, shot["image"], mask).log()
+        self.log_gains[index] += 0.2 * (found - self.log_gains[index])
+        return (self.log_gains[index] - self.log_gains.mean(0)).exp()
 
     def _consistency(
         self, vertices: Tensor, colors: Tensor, rendered: Rendered, shot: Mapping[str, Any], views: Views, mask: Tensor
