@@ -70,7 +70,8 @@ class SsGan3dStage(L.LightningModule):
 
     The epochs are shared equally among the levels. Each level starts by halving edges where the images differ most,
     until the mesh has the level's ``faces``, and compares images reduced ``shrink`` times. In the last level training
-    stops as soon as the overall loss is below ``threshold`` and fell by less than ``tolerance`` of itself in the last epochs.
+    stops as soon as the overall loss is below ``threshold`` and fell by less than ``tolerance`` of itself in the last
+    epochs.
 
     Args:
         generator: makes the generator from vertices, colours and ``step`` (``_partial_: true`` in the YAML).
