@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from overfly.callbacks.pictures import hand_over
 from overfly.mesh import Mesh, write_mesh
+from overfly.stages.refined_mesh import prepared
 from overfly.stages.ssgan3d import SsGan3dStage
 
 log = logging.getLogger("overfly")
@@ -36,7 +37,7 @@ class RefinementResults(L.Callback):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Measure and show the mesh that is started from, before anything moves."""
         stage, data = cast(SsGan3dStage, pl_module), cast(Any, trainer).datamodule
-        start = stage.prepared(data.mesh)
+        start = prepared(data.mesh, stage.device)
         batches = self._batches(trainer, stage)
         rows = [stage.measure(batch, start) for batch in batches]
         self.start = {f"start/{name}": float(np.mean([float(row[name]) for row in rows])) for name in rows[0]}
@@ -63,7 +64,7 @@ class RefinementResults(L.Callback):
         with torch.no_grad():
             vertices, colors = stage.mesh()
         mesh = Mesh(
-            vertices.double().cpu().numpy(), stage.faces.cpu().numpy(), (colors * 255).round().byte().cpu().numpy()
+            vertices.double().cpu().numpy(), stage.mesh.faces.cpu().numpy(), (colors * 255).round().byte().cpu().numpy()
         )
         write_mesh(_placed(mesh, data), self.folder / "refined.ply")
         self._draw(trainer, pl_module)
