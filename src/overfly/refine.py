@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from overfly.errors import InputError, unknown
+from overfly.run_folder import quoted
 
 GENERATORS = {"vertices": "free_vertices", "network": "mesh_generator"}
 
@@ -59,8 +60,8 @@ def refine(
     asked = [
         "stage=ssgan3d",
         f"model={GENERATORS[generator]}",
-        f"data.flight={_quoted(flight.resolve())}",
-        f"data.mesh={'null' if mesh is None else _quoted(mesh.resolve())}",
+        f"data.flight={quoted(flight.resolve())}",
+        f"data.mesh={'null' if mesh is None else quoted(mesh.resolve())}",
         f"data.faces={rough}",
         f"data.width={width}",
         f"data.hold_out={hold_out}",
@@ -74,20 +75,15 @@ def refine(
         before = [line for line in recorded.read_text().splitlines() if line and not line.startswith(_OWN)]
         if before == asked:
             return main([f"resume={out}"])
-        if not overwrite:
+        if overwrite:
+            shutil.rmtree(out)
+        elif (out / "checkpoints").is_dir():
             raise InputError(
                 f"{out} holds another refinement (other photographs or settings): give another --out, or --overwrite."
             )
-        shutil.rmtree(out)
     elif out.is_dir() and any(out.iterdir()):
         raise InputError(f"{out} is not empty and holds no refinement: give a new folder as --out.")
-    return main([*asked, f"hydra.run.dir={_quoted(out)}"])
+    return main([*asked, f"hydra.run.dir={quoted(out)}"])
 
 
 _OWN = ("hydra.run.dir=", "resume=")
-
-
-def _quoted(path: Path) -> str:
-    """A path as a value of an override, whatever characters it has."""
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"

@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -113,10 +113,18 @@ def _train_stage(cfg: DictConfig) -> float | None:
         if cfg.resume and last.is_file():
             log.info("%s: goes on from %s", cfg.stage_name, last)
         resume_from = str(last) if cfg.resume and last.is_file() else None
-        trainer.fit(stage, datamodule=data, ckpt_path=resume_from, weights_only=True)
-        if trainer.interrupted:
-            raise KeyboardInterrupt
+        try:
+            trainer.fit(stage, datamodule=data, ckpt_path=resume_from, weights_only=True)
+        except SystemExit as stop:  # so Lightning answers Ctrl+C
+            if trainer.interrupted:
+                raise KeyboardInterrupt from stop
+            raise
         metrics = {key: float(value) for key, value in trainer.callback_metrics.items()}
+        done = run_dir / "metrics.json"
+        if resume_from and not metrics and done.is_file():
+            log.info("%s: finished before, its results in %s are kept", cfg.stage_name, run_dir)
+            kept: float | None = json.loads(done.read_text()).get("monitored")
+            return kept
         best, monitored = _best(trainer, cfg.monitor, metrics)
         if cfg.test and data.has_test:
             results = trainer.test(stage, datamodule=data, ckpt_path=best, verbose=False, weights_only=True)
@@ -174,8 +182,9 @@ def _best(trainer: Any, monitor: str, metrics: dict[str, float]) -> tuple[str | 
 
 def warm_start(stage: Any, name: str, from_run: str | None) -> list[str]:
     """Start ``stage`` from another run's weights; one line for every part says where its weights came from."""
-    if from_run is None and name == "ssgan3d":
-        return ["ssgan3d: the mesh starts as the rough one, the critic at random (seeded)"]
+    if name == "ssgan3d":
+        start = ["ssgan3d: the mesh starts as the rough one, the critic at random (seeded)"]
+        return start if from_run is None else cast(list[str], stage.warm_start({}, from_run))
     if from_run is None:
         more = "" if name == "encoder" else f"; from_run=outputs/encoder/... starts {name} from a trained encoder"
         return [f"{name}: every weight starts at random (seeded){more}"]

@@ -86,4 +86,11 @@ def resumed(argv: Sequence[str]) -> list[str]:
         )
     kept = [line for line in recorded.read_text().splitlines() if line and not line.startswith("resume=")]
     first = next((i for i, item in enumerate(argv) if "=" in item and not item.startswith("-")), len(argv))
-    return [*argv[:first], *kept, *argv[first:], f"hydra.run.dir={folder}"]  # flags come before every override
+    given = [f"resume={quoted(folder)}" if item.startswith("resume=") else item for item in argv]
+    return [*given[:first], *kept, *given[first:], f"hydra.run.dir={quoted(folder)}"]  # flags before every override
+
+
+def quoted(path: Path) -> str:
+    """A path as a value of an override, whatever characters it has."""
+    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{text}'"
