@@ -45,6 +45,11 @@ class Photographs:
         """Width and height, pixels."""
         return self.images.shape[3], self.images.shape[2]
 
+    @property
+    def cameras(self) -> list[Camera]:
+        """Their pinholes."""
+        return [Camera(*self.size, *k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()) for k in self.intrinsics]
+
 
 def photographs(
     frames: Sequence[Frame], *, width: int | None, hold_out: int, multiple: int, origin: Array
@@ -59,7 +64,8 @@ def photographs(
         origin: [3], becomes the zero of the local frame.
 
     Raises:
-        InputError: there is only one frame, nothing would be left to refine on, or the images are of several sizes.
+        InputError: there is only one frame, nothing would be left to refine on, or the images are too small or of
+            several sizes.
     """
     import cv2
 
@@ -78,9 +84,12 @@ def photographs(
         camera = frame.camera.resized(wide, high)
         shrunk = cv2.resize(frame.image(), (wide, high), interpolation=cv2.INTER_AREA)
         image, seen = undistorted(shrunk, camera)
+        if min(wide, high) < multiple:
+            raise InputError(
+                f"{frame.name} is compared at only {wide} x {high} pixels: give a larger width, or images of "
+                f"{multiple} or more a side."
+            )
         high, wide = high // multiple * multiple, wide // multiple * multiple
-        if not high or not wide:
-            raise InputError(f"{frame.name} has only {wide} x {high} pixels: give images of {multiple} or more a side.")
         images.append(image[:high, :wide].astype(np.float32).transpose(2, 0, 1) / 255)
         valid.append(seen[:high, :wide])
         intrinsics.append(camera.matrix())
@@ -102,10 +111,12 @@ def photographs(
 
 
 def held_out(count: int, every: int) -> NDArray[np.bool_]:
-    """Which of ``count`` frames are held out: the middle one of every ``every``, so never the ends of the flight.
+    """Which of ``count`` frames are held out: the middle one of every ``every``, never an end of the flight [count].
+
+    One of three or more is held out however large ``every`` is, none of two.
 
     Raises:
-        InputError: ``every`` is 1 or negative, or fewer than two frames would remain.
+        InputError: ``every`` is 1 or negative.
     """
     if every == 1 or every < 0:
         raise InputError(
@@ -113,9 +124,7 @@ def held_out(count: int, every: int) -> NDArray[np.bool_]:
         )
     held = np.zeros(count, bool)
     if every:
-        held[every // 2 :: every] = True
-        if count == 2:
-            held[:] = False
+        held[min(every, count) // 2 : count - 1 : every] = True
     return held
 
 

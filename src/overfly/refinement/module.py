@@ -10,6 +10,7 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from overfly.cloud import Cloud, read_cloud
@@ -100,15 +101,14 @@ class PhotographModule(L.LightningDataModule):
         self.photographs = photographs(
             block.frames, width=self.width, hold_out=self.hold_out, multiple=MULTIPLE, origin=origin
         )
-        local = Mesh(mesh.vertices - origin, mesh.faces, mesh.colors)
+        local = Mesh(mesh.vertices - origin, with_area(mesh.faces), mesh.colors)
         check_overlap(local, self.photographs)
         if local.colors is None:
             log.info("The mesh has no colours: they are estimated from the photographs")
             sides = topology(local.faces, len(local.vertices))
             local = Mesh(local.vertices, local.faces, colors_from(local, sides, self.photographs))
         self.mesh = local
-        shots = [c.resized(*self.photographs.size) for c in block.cameras]
-        self.gsd = ground_sampling(Cloud(mesh.vertices), shots, block.poses)
+        self.gsd = ground_sampling(Cloud(mesh.vertices), self.photographs.cameras, block.poses)
         truth = self.reference or flight.reference
         self.shape = None
         if truth is not None:
@@ -138,8 +138,8 @@ class PhotographModule(L.LightningDataModule):
         folder = self._flight_folder()
         settings: dict[str, Any] = {"out": self.work, "cameras": self.cameras, "seed": self.seed, "dense": self.dense}
         if self.given is not None:
-            flight, block = align_flight(folder, **settings)
-            return flight, block, read_mesh(self.given)
+            mesh = read_mesh(self.given)  # first: aligning may take minutes
+            return *align_flight(folder, **settings), mesh
         if self.dense == "sweep":
             raise InputError("dense=sweep needs a trained network: map the flight first, or use data.dense=stereo.")
         flight, block, cloud = measure_flight(folder, **settings)
@@ -153,3 +153,8 @@ class PhotographModule(L.LightningDataModule):
         folder = self.cache_dir / "photographs" / key_of(self.synthetic)
         fly(**self.synthetic, out=folder)
         return folder
+
+
+def with_area(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Faces [F, 3] without those that name a vertex twice: they show nothing and cannot be subdivided."""
+    return faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
