@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
 import lightning as L
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from overfly import image_losses
 from overfly.errors import InputError, unknown
 from overfly.rendering.render import Rendered
 from overfly.rendering.reproject import reproject
+from overfly.stages.exposures import Exposures
 from overfly.stages.levels import PATIENCE, Levels, converged
 from overfly.stages.refined_mesh import Mesh, Prepared, RefinedMesh, prepared
 from overfly.stages.shots import Shot, patches, shot_of
@@ -28,12 +31,18 @@ SIMILARITY = ("alpha", "beta", "gamma", "centre", "slope")
 WEIGHTS = (*SIMILARITY, "adversarial", "theta", "consistency", "laplacian", "normal_consistency", "edge_length")
 
 
+class Photographs(Protocol):
+    """Those of one flight, and which of them are only measured on."""
+
+    held_out: NDArray[np.bool_]
+
+
 class Shots(Protocol):
     """What the stage asks of its data module, after ``setup``."""
 
     mesh: Mesh
     gsd: float
-    photographs: Sized
+    photographs: Photographs
 
 
 class SsGan3dStage(L.LightningModule):
@@ -107,7 +116,7 @@ class SsGan3dStage(L.LightningModule):
         self.robust, self.exposure, self.threshold, self.tolerance = robust, exposure, threshold, tolerance
         self.seed, self.level = seed, 0
         self.mesh: RefinedMesh
-        self.register_buffer("log_gains", torch.zeros(0, 3))
+        self.exposures: Exposures
         self.gsd = math.nan
         self.overall: dict[int, float] = {}  # mean overall loss by epoch, of this level
         self.stopped_by = "the number of epochs"
@@ -117,7 +126,7 @@ class SsGan3dStage(L.LightningModule):
         if not hasattr(self, "mesh"):
             data = cast(Shots, self.trainer.datamodule)  # type: ignore[attr-defined]
             self.gsd = float(data.gsd)
-            self.log_gains = torch.zeros(len(data.photographs), 3, device=self.device)
+            self.exposures = Exposures(data.photographs.held_out).to(self.device)
             start, step = prepared(data.mesh, "cpu"), self.step_gsd * self.gsd
             self.mesh = RefinedMesh(start, generator=self.make_generator, step=step).to(self.device)
 
@@ -213,19 +222,9 @@ class SsGan3dStage(L.LightningModule):
     def _reconstruction(self, rendered: Rendered, shot: Shot, mask: Tensor) -> Tensor:
         image = rendered.image
         if self.exposure:
-            image = image * self._exposures(image.detach(), shot, mask)[:, :, None, None]
+            image = image * self.exposures(image, shot, mask)[:, :, None, None]
         options = {name: self.weights[name] for name in SIMILARITY}
         return image_losses.reconstruction(image, shot.image, mask=mask, **options).mean()
-
-    @torch.no_grad()
-    def _exposures(self, image: Tensor, shot: Shot, mask: Tensor) -> Tensor:
-        """Gains [B, 3] of the photographs, smoothed over the steps; their mean over all photographs stays 1.
-
-        With a gain of its own for each step the colours would be free to drift: whatever is too dark would be lit.
-        """
-        found = image_losses.gains(image, shot.image, mask).log()
-        self.log_gains[shot.indices] += 0.2 * (found - self.log_gains[shot.indices])
-        return (self.log_gains[shot.indices] - self.log_gains.mean(0)).exp()
 
     def _consistency(self, present: Prepared, rendered: Rendered, shot: Shot, near: Shot, mask: Tensor) -> Tensor:
         with torch.no_grad():
