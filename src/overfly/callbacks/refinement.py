@@ -24,7 +24,7 @@ class RefinementResults(L.Callback):
 
     Args:
         folder: of the run.
-        photographs: held-out photographs of which pictures are made.
+        photographs: held-out photographs of which pictures are made (any, if none is held out).
         every_n_epochs: epochs between pictures.
     """
 
@@ -46,15 +46,15 @@ class RefinementResults(L.Callback):
             self.start |= {f"start/{name}": value for name, value in found.items()}
         self.before = [_image(stage.observe(batch, start)) for batch in batches[: self.photographs]]
         log.info("start: %s", _line(self.start, "start"))
-        if not trainer.fast_dev_run:  # type: ignore[attr-defined]
+        if not trainer.fast_dev_run and trainer.is_global_zero:  # type: ignore[attr-defined]
             write_mesh(_placed(data.mesh, data), self.folder / "start.ply")
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         pl_module.log_dict(self.start, on_step=False, on_epoch=True, batch_size=1)
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if (trainer.current_epoch + 1) % self.every_n_epochs == 0:
-            self._draw(trainer, pl_module)
+        if not trainer.sanity_checking and (trainer.current_epoch + 1) % self.every_n_epochs == 0:
+            self._draw(trainer, pl_module, trainer.current_epoch + 1)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         stage = cast(SsGan3dStage, pl_module)
@@ -67,7 +67,7 @@ class RefinementResults(L.Callback):
             vertices.double().cpu().numpy(), stage.mesh.faces.cpu().numpy(), (colors * 255).round().byte().cpu().numpy()
         )
         write_mesh(_placed(mesh, data), self.folder / "refined.ply")
-        self._draw(trainer, pl_module)
+        self._draw(trainer, pl_module, trainer.current_epoch)  # counted up already
         values = {name: float(value) for name, value in trainer.callback_metrics.items()}
         log.info("refined: %s", _line(values, "val"))
         log.info("Stopped by %s; the mesh is %s", stage.stopped_by, self.folder / "refined.ply")
@@ -76,19 +76,20 @@ class RefinementResults(L.Callback):
         loader = cast(Any, trainer).datamodule.val_dataloader()
         return [{name: value.to(stage.device) for name, value in batch.items()} for batch in loader]
 
-    def _draw(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        stage = cast(SsGan3dStage, pl_module)
+    def _draw(self, trainer: L.Trainer, pl_module: L.LightningModule, epochs: int) -> None:
+        stage, shots = cast(SsGan3dStage, pl_module), cast(Any, trainer).datamodule.photographs
         if trainer.fast_dev_run or not trainer.is_global_zero:  # type: ignore[attr-defined]
             return
         folder = self.folder / "pictures"
         folder.mkdir(parents=True, exist_ok=True)
         batches = self._batches(trainer, stage)[: self.photographs]
         for i, (batch, before) in enumerate(zip(batches, self.before, strict=True)):
-            name = cast(Any, trainer).datamodule.photographs.names[int(batch["index"][0])]
-            path = folder / f"held_out_{i}.png"
+            index = int(batch["index"][0])
+            kind = "not refined on" if shots.held_out[index] else "refined on"
+            path = folder / f"photograph_{i}.png"
             plot_photograph(
                 _image(batch["image"]), before, _image(stage.observe(batch)), path,
-                f"{name}, not refined on; epoch {trainer.current_epoch + 1}",
+                f"{shots.names[index]}, {kind}; epoch {epochs}",
             )  # fmt: skip
             hand_over(trainer, f"val/photograph_{i}", path)
 

@@ -16,6 +16,9 @@ from overfly.rendering.topology import Topology
 HIDDEN = 0.01
 """Share of its depth by which a vertex may lie behind what a photograph shows there."""
 
+VALID = 0.999
+"""Share of a colour that has to come from pixels that the photograph covers."""
+
 
 def views_of(photographs: Photographs, chosen: NDArray) -> Views:
     """The cameras of some photographs."""
@@ -67,6 +70,8 @@ def colors_from(mesh: Mesh, topology: Topology, photographs: Photographs) -> NDA
         grid = place[None, :, None]
         shown = grid_sample(depth[:, None], grid, mode="nearest", align_corners=False)[0, 0, :, 0]
         seen = (z > 0) & (place.abs() < 1).all(1) & (shown > 0) & (z - shown < HIDDEN * z)
+        valid = torch.from_numpy(photographs.valid[index]).float()[None, None]
+        seen &= grid_sample(valid, grid, align_corners=False)[0, 0, :, 0] > VALID
         image = torch.from_numpy(photographs.images[index])[None]
         found = grid_sample(image, grid, padding_mode="border", align_corners=False)[0, :, :, 0].T
         total += torch.where(seen[:, None], found, 0.0)

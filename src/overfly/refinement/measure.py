@@ -24,15 +24,16 @@ class ShapeMeasure:
 
     Args:
         truth: points on the true surface, in the meshes' frame.
-        mesh: true points outside the plan cells in which it has vertices do not count, now and later.
+        mesh: true points outside the plan cells in which it has some of its surface do not count, now and later.
 
     Raises:
         InputError: the mesh covers none of the true points.
     """
 
     def __init__(self, truth: Cloud, mesh: Mesh) -> None:
-        low = mesh.vertices[:, :2].min(0)
-        cells = np.floor((mesh.vertices[:, :2] - low) / CELL_M).astype(np.int64)
+        surface = np.concatenate([mesh.vertices, mesh.sample(SAMPLES, np.random.default_rng(0)).points])[:, :2]
+        low = surface.min(0)
+        cells = np.floor((surface - low) / CELL_M).astype(np.int64)
         covered = np.zeros(cells.max(0) + 1, bool)
         covered[tuple(cells.T)] = True
         places = np.floor((truth.points[:, :2] - low) / CELL_M).astype(np.int64)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from overfly.rendering.render import Rendered, Views
+from overfly.rendering.render import NEAR, Rendered, Views
 
 HIDDEN = 0.01
 """A point is hidden from a camera that sees something nearer there, by more than this share of the point's depth."""
@@ -41,7 +41,7 @@ def reproject(
     points = torch.stack([u[:, None] * z, v[..., None] * z, z], -1).flatten(1, 2)  # [B, H W, 3], axes of target
     across = views.camera_from_world.to(dtype) @ torch.linalg.inv(target.camera_from_world.to(dtype))
     points = points @ across[:, :3, :3].transpose(1, 2) + across[:, None, :3, 3]
-    ahead = points[..., 2] > HIDDEN
+    ahead = points[..., 2] > NEAR
     safe = torch.where(ahead, points[..., 2], torch.ones_like(points[..., 2]))
     focal, centre = (views.intrinsics[:, None, [0, 1], axis].to(dtype) for axis in ([0, 1], [2, 2]))
     size = torch.tensor(views.size, device=k.device, dtype=dtype)
