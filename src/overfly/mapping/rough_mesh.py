@@ -22,6 +22,8 @@ PARTS = 4
 TRIM = 0.001
 """Share of the points left out on each side of the grid: single stray points."""
 
+NO_GROUND = "The cloud covers no connected ground: a mesh needs points that lie beside each other."
+
 
 def rough_mesh(cloud: Cloud, *, faces: int) -> Mesh:
     """Triangulate the upper surface of a cloud.
@@ -41,16 +43,19 @@ def rough_mesh(cloud: Cloud, *, faces: int) -> Mesh:
         raise InputError(f"A mesh of {faces} faces shows no landscape: ask for 1000 or more.")
     if len(cloud) < 8:
         raise InputError(f"{len(cloud)} points are too few for a mesh: give a dense cloud.")
-    extent = np.ptp(cloud.points[:, :2], axis=0)
-    cell = float(np.sqrt(max(2 * extent[0] * extent[1], 1e-12) / faces))
+    low, high = np.quantile(cloud.points[:, :2], [TRIM, 1 - TRIM], axis=0)
+    width, depth = high - low
+    if min(width, depth) * faces < max(width, depth):  # a line: its cells would be without number
+        raise InputError(NO_GROUND)
+    cell = float(np.sqrt(2 * width * depth / faces))
     mesh = _triangulated(cloud, grid_over(cloud.points, cell, trim=TRIM))
     for _ in range(4):  # the covered share of the grid depends a little on its cells
         if not len(mesh.faces) or 0.9 * faces <= len(mesh.faces) <= 1.05 * faces:
             break
-        cell *= float(np.sqrt(len(mesh.faces) / (0.98 * faces)))
+        cell *= max(float(np.sqrt(len(mesh.faces) / (0.98 * faces))), 0.5)  # not at once to cells without number
         mesh = _triangulated(cloud, grid_over(cloud.points, cell, trim=TRIM))
     if not len(mesh.faces):
-        raise InputError("The cloud covers no connected ground: a mesh needs points that lie beside each other.")
+        raise InputError(NO_GROUND)
     return mesh
 
 
