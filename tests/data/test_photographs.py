@@ -142,7 +142,7 @@ def test_what_cannot_be_refined_on_is_refused(tmp_path: Path) -> None:
     image, camera = np.zeros((40, 40, 3), np.uint8), Camera(40, 40, 30.0, 30.0, 20.0, 20.0)
     one = frame(tmp_path, "one", image, camera, nadir(0))
     options = {"width": None, "hold_out": 0, "multiple": 16, "origin": np.zeros(3)}
-    with pytest.raises(InputError, match="^1 photograph cannot show depth"):
+    with pytest.raises(InputError, match=r"^1 photograph cannot show depth"):
         photographs([one], **options)
     wide = frame(tmp_path, "wide", np.zeros((40, 60, 3), np.uint8), replace(camera, width=60), nadir(1))
     with pytest.raises(InputError, match=r"several sizes \(32 x 32 and 48 x 32\)"):
