@@ -77,7 +77,7 @@ def refine(
             return main([f"resume={out}"])
         if overwrite:
             shutil.rmtree(out)
-        elif (out / "checkpoints").is_dir():
+        elif (out / "checkpoints" / "last.ckpt").is_file():
             raise InputError(
                 f"{out} holds another refinement (other photographs or settings): give another --out, or --overwrite."
             )
