@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from overfly.configuration import build, check, conf_dir, register_resolvers
 from overfly.errors import InputError
+from overfly.stages.ssgan3d import WEIGHTS as SSGAN3D_WEIGHTS
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().glob("*/*.yaml"))
@@ -173,3 +174,34 @@ def test_configurations_travel_with_the_installed_package() -> None:
 
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
     assert wheel["force-include"] == {"conf": "overfly/conf"}
+
+
+def test_the_sweep_of_the_refinements_weights_names_keys_that_exist() -> None:
+    sweep = OmegaConf.load(conf_dir() / "sweep" / "ssgan3d_weights.yaml")
+    names = list(sweep.hydra.sweeper.params)
+    cfg = composed("stage=ssgan3d", "sweep=ssgan3d_weights")
+    for name in names:
+        assert isinstance(OmegaConf.select(cfg, name), int | float), name
+    assert {name.split(".")[1] for name in names if name.startswith("loss.")} <= set(SSGAN3D_WEIGHTS)
+    assert set(cfg.loss) <= set(SSGAN3D_WEIGHTS)
+    assert cfg.monitor == sweep.monitor == "val/chamfer_m"
+    assert composed("sweep=ssgan3d_weights").monitor == "val/chamfer_m"
+
+
+def test_the_papers_refinement_has_a_network_over_the_vertices_and_resnet_101_for_a_critic() -> None:
+    from functools import partial
+
+    from overfly.networks import Critic, MeshGenerator
+
+    cfg = composed("experiment=ssgan3d")
+    assert cfg.stage_name == "ssgan3d"
+    assert cfg.data._target_ == "overfly.refinement.PhotographModule"
+    assert cfg.data.synthetic.altitude == cfg.altitude
+    assert cfg.model.critic.depth == 101
+    small = composed("experiment=ssgan3d", "model.critic.width=2")  # the whole one takes seconds to build
+    stage = build(small.stage)
+    assert isinstance(stage.make_generator, partial)
+    assert stage.make_generator.func is MeshGenerator
+    assert isinstance(stage.critic, Critic)
+    assert sum(type(module).__name__ == "Conv2d" for module in stage.critic.modules()) > 100
+    assert composed("experiment=ssgan3d_small").model.generator._target_ == "overfly.networks.FreeVertices"
