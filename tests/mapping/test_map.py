@@ -237,6 +237,7 @@ def test_a_moved_flight_is_still_the_same(tmp_path: Path) -> None:
         ({"dense": "magic"}, "--dense 'magic' is unknown"),
         ({"cameras": "some"}, "--cameras 'some' is unknown"),
         ({"max_memory_gb": 0}, "--max-memory 0"),
+        ({"size": 10}, "--size 10"),
     ],
 )
 def test_wrong_settings_are_refused_before_anything_is_written(

@@ -18,7 +18,7 @@ from overfly.flights import Flight, read_flight
 from overfly.mapping.block import Block, checked, given_block, keep_cloud, kept_cloud, read_block, write_block
 from overfly.mapping.deliver import deliver
 from overfly.mapping.report import count_text
-from overfly.mapping.settings import MapSettings
+from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of
 
 FEWEST_POINTS = 30
@@ -104,7 +104,8 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
 def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, Cloud]:
     block, key = _aligned(flight, identity, asked, steps)
     check_memory(block, asked)
-    key = key_of(key, asked.dense, _network_key(asked) if asked.dense == "sweep" else None, asked.seed)
+    network = _network_key(asked) if asked.dense == "sweep" else None
+    key = key_of(key, asked.dense, network, asked.seed, *([] if asked.size == SIZE else [asked.size]))
     make: Callable[[Path], Cloud] = {
         "sweep": lambda scratch: sweep_cloud(block, flight, scratch, asked, steps),
         "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
@@ -175,7 +176,13 @@ def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinio
 
     with steps.bar("dense", "depth maps") as update:
         maps = stereo(
-            block.frames, workdir=scratch, points=block.points, seed=asked.seed, opinions=opinions, progress=update
+            block.frames,
+            workdir=scratch,
+            points=block.points,
+            max_size=asked.size,
+            seed=asked.seed,
+            opinions=opinions,
+            progress=update,
         )
     with steps.bar("dense", "fused") as update:
         return fuse(maps, block.frames, progress=update)

@@ -12,6 +12,9 @@ from overfly.mapping.sweep import TrainedRun
 CAMERAS = ("auto", "given", "estimate")
 DENSE = ("sweep", "stereo")
 
+SIZE = 1600
+"""Default of the longest side at which images are matched, pixels."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MapSettings:
@@ -28,6 +31,7 @@ class MapSettings:
         resume: reuse finished steps of an earlier map of the same images with the same settings.
         overwrite: replace another flight's map in the same folder.
         ply: write ``cloud.ply`` too.
+        size: longest side at which images are matched, pixels: a half takes a quarter of the time.
         seed: of every random choice.
         progress: tell each step on stderr.
     """
@@ -41,6 +45,7 @@ class MapSettings:
     resume: bool = True
     overwrite: bool = False
     ply: bool = False
+    size: int = SIZE
     seed: int = 0
     progress: bool = True
 
@@ -61,6 +66,10 @@ class MapSettings:
                 f"The matcher {self.matcher} needs a trained network: give --network RUN (a run folder of train.py), "
                 "or match without one by --matcher sift."
             )
+        if self.size < 64:
+            raise InputError(
+                f"--size {self.size} is too small to match images: give 64 pixels or more, such as {SIZE}."
+            )
         if self.max_memory_gb is not None and not self.max_memory_gb > 0:
             raise InputError(f"--max-memory {self.max_memory_gb} is not possible: give gigabytes above 0, such as 4.")
 
@@ -72,5 +81,6 @@ class MapSettings:
             "matcher": self.matcher,
             "network": self.network_name if self.dense == "sweep" or self.matcher != "sift" else None,
             "max_memory_gb": self.max_memory_gb,
+            "size": self.size,
             "seed": self.seed,
         }

@@ -22,6 +22,7 @@ from overfly.mapping.block import Block
 from overfly.mapping.facts import ground_sampling
 from overfly.mapping.map import align_flight, measure_flight
 from overfly.mapping.rough_mesh import rough_mesh
+from overfly.mapping.settings import SIZE
 from overfly.mapping.steps import key_of
 from overfly.mesh import Mesh, read_mesh
 from overfly.refinement.colors import check_overlap, colors_from
@@ -137,6 +138,10 @@ class PhotographModule(L.LightningDataModule):
     def _rough(self) -> tuple[Flight, Block, Mesh]:
         folder = self._flight_folder()
         settings: dict[str, Any] = {"out": self.work, "cameras": self.cameras, "seed": self.seed, "dense": self.dense}
+        if self.width is not None:
+            settings["size"] = min(
+                max(self.width, 64), SIZE
+            )  # finer stereo than the photographs are compared at is in vain
         if self.given is not None:
             mesh = read_mesh(self.given)  # first: aligning may take minutes
             return *align_flight(folder, **settings), mesh
