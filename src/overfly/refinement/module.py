@@ -138,10 +138,8 @@ class PhotographModule(L.LightningDataModule):
     def _rough(self) -> tuple[Flight, Block, Mesh]:
         folder = self._flight_folder()
         settings: dict[str, Any] = {"out": self.work, "cameras": self.cameras, "seed": self.seed, "dense": self.dense}
-        if self.width is not None:
-            settings["size"] = min(
-                max(self.width, 64), SIZE
-            )  # finer stereo than the photographs are compared at is in vain
+        if self.width is not None:  # finer stereo than the photographs are compared at is in vain
+            settings["size"] = min(max(self.width, 64), SIZE)
         if self.given is not None:
             mesh = read_mesh(self.given)  # first: aligning may take minutes
             return *align_flight(folder, **settings), mesh
