@@ -17,6 +17,7 @@ from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
 from overfly.mapping.block import Block, checked, given_block, keep_cloud, kept_cloud, read_block, write_block
 from overfly.mapping.deliver import deliver
+from overfly.mapping.needs import memory_gb
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of
@@ -116,12 +117,12 @@ def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -
 
 
 def check_memory(block: Block, asked: MapSettings) -> None:
-    """Refuse before the work starts what would not fit: 1 GB and 40 MB for each megapixel (measured on real flights).
+    """Refuse before the work starts what would not fit, by the estimate of :mod:`overfly.mapping.needs`.
 
     Raises:
         InputError: more than ``max_memory_gb`` would be needed.
     """
-    needed = 1.0 + 0.04 * sum(camera.width * camera.height for camera in block.cameras) / 1e6
+    needed = memory_gb((camera.width, camera.height) for camera in block.cameras)
     if asked.max_memory_gb is not None and needed > asked.max_memory_gb:
         raise InputError(
             f"Mapping these {len(block.frames)} images takes about {needed:.1f} GB, more than --max-memory "
