@@ -22,6 +22,7 @@ ORDER = [
     ["stages"],
     ["callbacks"],
     ["mapping"],
+    ["preflight"],
     ["refinement"],
     ["evaluation"],
     ["configuration", "summary", "run_folder", "run", "evaluate", "shipped", "refine"],

@@ -75,6 +75,56 @@ def fly(
     print(plan.summary())
 
 
+@app.command()
+def plan(
+    area: Annotated[
+        str, typer.Option(help="WIDTHxHEIGHT in metres, LAT,LON,WIDTH,HEIGHT, or a .kml/.geojson polygon.")
+    ],
+    camera: Annotated[str, typer.Option(help="A camera: phantom4, p4p, mavic2pro, mavic3e, p1, ...")],
+    gsd: Annotated[float | None, typer.Option(help="Centimetres per pixel on the ground.")] = None,
+    altitude: Annotated[float | None, typer.Option(help="Or metres above ground, 20 to 500.")] = None,
+    path: Annotated[str, typer.Option(help="grid, double_grid or circular.")] = "grid",
+    overlap: Annotated[float, typer.Option(help="Along the lines, percent.")] = 80,
+    side_overlap: Annotated[float, typer.Option(help="Between lines, percent.")] = 60,
+    speed: Annotated[float | None, typer.Option(help="Metres a second. Default: a photo every 2 s, at most 8.")] = None,
+    at: Annotated[str | None, typer.Option(help="LAT,LON of the area's middle; waypoint files need it.")] = None,
+    kml: Annotated[Path | None, typer.Option(help="Write the flight here as KML.")] = None,
+    litchi: Annotated[Path | None, typer.Option(help="Write the mission here as Litchi CSV.")] = None,
+) -> None:
+    """Before flying: path, height, photographs, time and expected accuracy for an area; waypoint files."""
+    from overfly.preflight.report import plan_and_tell
+
+    plan_and_tell(
+        area,
+        kml=kml,
+        litchi=litchi,
+        camera=camera,
+        gsd_cm=gsd,
+        altitude=altitude,
+        path=path,
+        overlap=overlap,
+        side_overlap=side_overlap,
+        speed=speed,
+        at=at,
+    )
+
+
+@app.command()
+def check(
+    flight: Annotated[Path, typer.Argument(help="A flight folder, or any folder of drone photos.")],
+    altitude: Annotated[
+        float | None, typer.Option(help="Metres over ground, where the photos do not tell it or tell it wrongly.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the figures and findings here.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Write the overlap map here, as PNG.")] = None,
+    processes: Annotated[int, typer.Option(help="That look at images side by side.")] = 1,
+) -> None:
+    """Before mapping: overlap, gaps, expected accuracy, blur, GPS faults, time; each with its remedy."""
+    from overfly.preflight.report import check_and_tell
+
+    raise SystemExit(check_and_tell(flight, altitude=altitude, json=json, picture=picture, processes=processes))
+
+
 @app.command("map")
 def map_(
     flight: Annotated[Path, typer.Argument(help="A flight folder, or any folder of drone photos.")],

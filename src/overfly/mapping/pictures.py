@@ -111,9 +111,20 @@ def height_map(seen: Surface, *, offset: float = 0.0, unit: str = "m", width_in:
 
 
 def views_map(
-    grid: Grid, views: ArrayLike, *, unit: str = "m", width_in: float = 5.6, outlines: Sequence[Array] = ()
+    grid: Grid,
+    views: ArrayLike,
+    *,
+    unit: str = "m",
+    width_in: float = 5.6,
+    outlines: Sequence[Array] = (),
+    track: Array | None = None,
+    wanted: Sequence[Array] = (),
 ) -> Image:
-    """How many frames see each cell [rows, columns]; NaN where nothing was mapped."""
+    """How many frames see each cell [rows, columns]; NaN where nothing was mapped.
+
+    Footprints may be drawn by their ``outlines``, the cameras by their ``track`` [n, 2], and lines that should be flown
+    too as ``wanted`` [m, 2].
+    """
     from matplotlib.colors import BoundaryNorm, ListedColormap
 
     figure, axes = _map_figure(grid, width_in)
@@ -123,6 +134,10 @@ def views_map(
     axes.imshow(shown, extent=grid.extent, interpolation="nearest", cmap=colours, norm=norm)
     for outline in outlines:
         axes.fill(outline[:, 0], outline[:, 1], fill=False, edgecolor=INK, linewidth=0.4, alpha=0.35)
+    if track is not None:
+        axes.plot(track[:, 0], track[:, 1], "-o", color=INK, linewidth=0.6, markersize=1.8, alpha=0.7)
+    for line in wanted:
+        axes.plot(line[:, 0], line[:, 1], "--", color="#7b1fa2", linewidth=2)
     bar = figure.colorbar(
         _mappable(norm, colours), ax=axes, shrink=0.8, pad=0.02, aspect=30, ticks=[1, 2, 3, 4.5, 7.5, 500]
     )
