@@ -30,6 +30,7 @@ VARIANTS = {
     # A peer without anything of ours: vertices and colours down the paper's Eq. 6 alone.
     "descent": ["loss.adversarial=0", "loss.consistency=0"],
 }
+PATHS = {"grid": [], "circular": ["overlap=80"]}  # 20 and 19 photographs
 COLUMNS = {
     "psnr_db": ("PSNR, dB", "{:+.2f}"),
     "ssim": ("SSIM", "{:+.3f}"),
@@ -43,7 +44,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/refinements"))
     parser.add_argument("--scenes", nargs="+", default=["blocks", "village", "campus"])
-    parser.add_argument("--paths", nargs="+", default=["grid", "circular"])
+    parser.add_argument("--paths", nargs="+", default=list(PATHS), choices=list(PATHS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
     parser.add_argument("more", nargs="*", help="overrides of every run, such as stage.epochs=6")
@@ -66,7 +67,8 @@ def refine(out: Path, scene: str, path: str, seed: int, variant: str, more: Iter
     command = [
         sys.executable, "train.py", "experiment=ssgan3d_small", f"flight_path={path}", f"data.synthetic.scene={scene}",
         f"data.synthetic.seed={100 + seed}", f"seed={seed}", f"data.work={out / f'{scene}-{path}-{seed}-rough'}",
-        f"hydra.run.dir={folder}", "trainer.enable_progress_bar=false", *VARIANTS[variant], *more,
+        f"hydra.run.dir={folder}", "trainer.enable_progress_bar=false", *PATHS[path],
+        *VARIANTS[variant], *more,
     ]  # fmt: skip
     start = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
