@@ -93,6 +93,17 @@ def test_a_run_of_all_phases_leaves_everything_that_the_readme_promises(finished
     assert any(key.startswith("test/chamfer_m2") for key in full)
 
 
+def test_a_stopped_run_goes_on_from_its_last_epoch_better_or_not(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    train("experiment=smoke", "stage=encoder", "monitor_mode=max", "trainer.max_epochs=3", "hydra.run.dir=run")
+    rows = [row["val/loss"] for row in read_rows(tmp_path / "run" / "metrics.csv") if "val/loss" in row]
+    assert rows[-1] < max(rows)  # so the last epoch is not the best one by this measure
+    epochs = {
+        name: torch.load(tmp_path / "run" / "checkpoints" / f"{name}.ckpt", weights_only=True)["epoch"]
+        for name in ("best", "last")
+    }
+    assert epochs["best"] < epochs["last"] == 2
+
+
 def test_each_phase_says_where_its_weights_came_from(finished: Path) -> None:
     text = (finished / "train.log").read_text()
     assert "encoder: every weight starts at random" in text
