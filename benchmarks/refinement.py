@@ -30,7 +30,7 @@ VARIANTS = {
     # A peer without anything of ours: vertices and colours down the paper's Eq. 6 alone.
     "descent": ["loss.adversarial=0", "loss.consistency=0"],
 }
-PATHS = {"grid": [], "circular": ["overlap=80"]}  # 20 and 19 photographs
+PATHS = {"grid": [], "circular": ["overlap=84", "data.synthetic.frames=24"]}  # 16 to 24 photographs
 COLUMNS = {
     "psnr_db": ("PSNR, dB", "{:+.2f}"),
     "ssim": ("SSIM", "{:+.3f}"),
