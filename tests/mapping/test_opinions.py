@@ -128,6 +128,8 @@ def test_where_nothing_matches_the_networks_word_stands_and_is_marked(hill, stri
     assert np.quantile(np.abs(hill.off(cloud.points)), 0.99) < 1.0
     from scipy.spatial import cKDTree
 
+    kept, _ = cKDTree(cloud.points).query(measured.points)
+    assert (kept < 1e-6).mean() > 0.98
     far, _ = cKDTree(measured.points[:, :2]).query(cloud.points[cloud.predicted][:, :2])
     assert np.median(far) > 2.0  # predicted points lie where nothing was measured
     assert cloud.views[cloud.predicted].max() == 1

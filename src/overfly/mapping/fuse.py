@@ -153,13 +153,16 @@ def _points(
     depth: Map = data["depth"]
     sigma = data["sigma"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
+    second = data.get("second", guessed)
     widest = WIDEST * depth / own.camera.fx
     weight = 1 / sigma**2
     total, mean = weight.copy(), weight * depth
     agree, deny, seen = (np.zeros(depth.shape, np.uint8) for _ in range(3))
     taken = np.zeros(depth.shape, bool)
     for j, other in partners.items():
-        found, spread, given, inside = _look_up(own, depth, depth_maps[j], other, used.get(j))
+        found, spread, given, inside, theirs = _look_up(own, depth, depth_maps[j], other, used.get(j))
+        # What pairs have matched is judged by what pairs have matched alone: the cloud of them is that of stereo.
+        found = np.where(theirs & ~second, np.float32(np.nan), found)
         with np.errstate(invalid="ignore"):
             gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
             same = np.abs(found - depth) < gate
@@ -195,15 +198,16 @@ def _points(
         views=(1 + votes).astype(np.uint8),
         predicted=alone[fresh],
     )
-    gsd = float(np.median(merged)) / own.camera.fx if len(merged) else float("nan")
-    return cloud, data.get("second", guessed)[fresh], known, gsd
+    measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
+    gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
+    return cloud, second[fresh], known, gsd
 
 
 def _look_up(
     own: DepthMap, depth: Map, other: DepthMap, data: Mapping[str, NDArray], given: NDArray[np.bool_] | None
-) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_]]:
-    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given, and
-    whether the other frame has the place inside at all."""
+) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given, whether
+    the other frame has the place inside at all, and whether no pair has matched it there."""
     import cv2
 
     q, t = frame_to_frame(own.camera, own.world_from_camera, other.camera, other.world_from_camera)
@@ -217,13 +221,15 @@ def _look_up(
         cv2.remap(data[name], u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
         for name in ("depth", "sigma")
     )
-    if given is None:
-        was = np.zeros(depth.shape, bool)
-    else:
-        was = cv2.remap(given.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+    was, theirs = (
+        np.zeros(depth.shape, bool)
+        if mask is None
+        else cv2.remap(mask.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+        for mask in (given, data.get("second"))
+    )
     inside = (u > 0) & (v > 0) & (u < other.camera.width - 1) & (v < other.camera.height - 1)
     # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
-    return there / third, spread / third, was, inside
+    return there / third, spread / third, was, inside, theirs
 
 
 def _undistorted(frame: Frame, own: DepthMap) -> NDArray[np.uint8]:

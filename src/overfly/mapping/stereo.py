@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.flights import Frame
@@ -181,6 +182,25 @@ def _match(flight: Views, pair: tuple[int, int], ranges: list[tuple[float, float
     part.replace(path)
 
 
+def _at_full_size(
+    flight: Views, i: int, chosen: list[int], depth: Map, support: NDArray[np.uint8]
+) -> dict[str, NDArray]:
+    """A depth map of half the size, refined at full size: depth, sigma, support and score."""
+    import cv2
+
+    size = (flight.full[i].width, flight.full[i].height)
+    if not np.isfinite(depth).any():
+        nothing = np.full(size[::-1], np.nan, np.float32)
+        none = np.zeros(nothing.shape, np.uint8)
+        return {"depth": nothing, "sigma": nothing, "support": none, "score": np.full_like(nothing, -1)}
+    large = cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR)
+    support = np.asarray(cv2.resize(support, size, interpolation=cv2.INTER_NEAREST))
+    refined = refine(flight.shot(i), [flight.shot(j) for j in chosen], large, steps=(-1, -0.5, 0, 0.5, 1), best=2)
+    support[~np.isfinite(refined.depth)] = 0
+    sigma = refined.step * np.float32(REFINED_SIGMA)
+    return {"depth": refined.depth, "sigma": sigma, "support": support, "score": refined.score}
+
+
 def _depth(
     flight: Views,
     i: int,
@@ -208,44 +228,33 @@ def _depth(
     half = flight.half[i]
     shape = half.height, half.width
     if depths:
-        depth, sigma, support = consensus(depths, sigmas)
+        depth, _, support = consensus(depths, sigmas)
     else:
         depth, support = np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
-    paired = np.isfinite(depth)
+    full = _at_full_size(flight, i, chosen, depth, support)
+    paired = np.isfinite(full["depth"])
     opinion = None if ask is None else ask(i, chosen, _sample(depth, half, flight.poses[i]))
     if opinion is not None:
         # It has no vote where pairs were matched: with its wide sigma it would agree with wrong matches, too.
         said = cv2.resize(opinion.depth, shape[::-1], interpolation=cv2.INTER_LINEAR)
         seen_again = cv2.resize(opinion.views, shape[::-1], interpolation=cv2.INTER_NEAREST) >= 2
-        fill = ~paired & seen_again & np.isfinite(said)
+        fill = ~np.isfinite(depth) & seen_again & np.isfinite(said)
         # The network is less exact than a pair: it may be off by more than the last step's pixel.
         others = [flight.half_shot(j) for j in chosen]
-        moved = refine(flight.half_shot(i), others, np.where(fill, said, depth), steps=(-2, -1, 0, 1, 2))
-        depth, support = np.where(fill, moved.depth, depth), np.where(fill, np.uint8(1), support)
-    size = (flight.full[i].width, flight.full[i].height)
-    if np.isfinite(depth).any():
-        full = cv2.resize(depth, size, interpolation=cv2.INTER_LINEAR)
-        support = cv2.resize(support, size, interpolation=cv2.INTER_NEAREST)
-        refined = refine(flight.shot(i), [flight.shot(j) for j in chosen], full, steps=(-1, -0.5, 0, 0.5, 1), best=2)
-        full, score = refined.depth, refined.score
-        sigma = refined.step * np.float32(REFINED_SIGMA)
-        support[~np.isfinite(full)] = 0
-        paired = cv2.resize(paired.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    else:
-        full = np.full(size[::-1], np.nan, np.float32)
-        sigma, score, support = full, np.full_like(full, -1), np.zeros(full.shape, np.uint8)
-        paired = support > 0
-    if opinion is not None:
-        sure = np.where((score >= SURE) & (support >= 1), full, np.float32(np.nan))
+        guess = np.where(fill, said, np.float32(np.nan))
+        moved = refine(flight.half_shot(i), others, guess, steps=(-2, -1, 0, 1, 2))
+        filled = _at_full_size(flight, i, chosen, moved.depth, np.isfinite(moved.depth).astype(np.uint8))
+        full = {name: np.where(paired, values, filled[name]) for name, values in full.items()}
+        sure = np.where((full["score"] >= SURE) & (full["support"] >= 1), full["depth"], np.float32(np.nan))
         opinion = opinion.settled(sure, flight.full[i], flight.poses[i])
     part = path.with_suffix(".part")
     with part.open("wb") as file:
         np.savez(
             file,
-            depth=full,
-            sigma=sigma.astype(np.float16),
-            support=support,
-            score=np.round(np.clip(np.nan_to_num(score, nan=-1), -1, 1) * 100).astype(np.int8),
+            depth=full["depth"],
+            sigma=full["sigma"].astype(np.float16),
+            support=full["support"],
+            score=np.round(np.clip(np.nan_to_num(full["score"], nan=-1), -1, 1) * 100).astype(np.int8),
             paired=paired,
             **({} if opinion is None else {f"opinion_{name}": value for name, value in vars(opinion).items()}),
         )
