@@ -129,8 +129,8 @@ def across_of(xy: Array, direction: float) -> tuple[Array, Array]:
 
 
 def parallel(xy: Array, lines: list[NDArray[np.int64]], direction: float) -> list[NDArray[np.int64]]:
-    """The lines within 20 degrees of a direction, in their order across it."""
-    kept = [line for line in lines if abs((_bearing(xy, line) - direction + 90) % 180 - 90) < 20]
+    """The lines within 20 degrees of a direction, in their order across it; two images are a step and no line."""
+    kept = [line for line in lines if len(line) > 2 and abs((_bearing(xy, line) - direction + 90) % 180 - 90) < 20]
     return sorted(kept, key=lambda line: float(np.median(across_of(xy[line], direction)[1])))
 
 

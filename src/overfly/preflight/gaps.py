@@ -23,6 +23,9 @@ LEAST_SIDE_OVERLAP = 0.5
 LEAST_FORWARD_OVERLAP = 0.5
 """Where images of a line share less, ground is lost along the lines and not between them."""
 
+SLACK = 0.15
+"""Spacings by which an extra line would be saved: a few percent less overlap are no reason to fly one more."""
+
 SMALLEST = 0.004
 """Share of the flown area under which a gap is not worth a line."""
 
@@ -38,8 +41,8 @@ class Gap:
         spacing: between lines, old or new, metres.
         heading: of the new lines, degrees clockwise from north, 0..180.
         apart: distance of the lines on both sides, metres; 0 without.
-        between: numbers of the flown lines on both sides, counted across the flight from 1; None where the lines of the
-            flight do not enclose it.
+        between: numbers of the flown lines on both sides, from 1 at the side that was flown first; None where lines
+            do not enclose it.
         again: whether a line was flown there and only lacks images.
         starts, ends: of the new lines, x, y [count, 2].
     """
@@ -112,8 +115,20 @@ def gaps_of(seen: Coverage, xy: Array) -> list[Gap]:
                 cells.setdefault((k, k + 1), [])
     reach = across_of(xy[np.concatenate(seen.lines)], seen.direction or 0.0)[0] if seen.lines else np.zeros(1)
     ends = float(reach.min()), float(reach.max())
-    found = [_gap(seen, np.concatenate([np.zeros((0, 2)), *parts]), key, lines, ends) for key, parts in cells.items()]
+    backwards = _from_the_other_side(xy, seen, lines)
+    found = [
+        _gap(seen, np.concatenate([np.zeros((0, 2)), *parts]), key, lines, ends, backwards)
+        for key, parts in cells.items()
+    ]
     return sorted(found, key=lambda gap: -gap.area)
+
+
+def _from_the_other_side(xy: Array, seen: Coverage, lines: list[float]) -> bool:
+    """Whether the line that was flown first lies at the end of ``lines``."""
+    if seen.direction is None or not lines:
+        return False
+    first = min(parallel(xy, seen.lines, seen.direction), key=lambda line: int(line[0]))
+    return bool(np.median(across_of(xy[first], seen.direction)[1]) > (lines[0] + lines[-1]) / 2)
 
 
 def _merged(xy: Array, lines: list[NDArray[np.int64]], seen: Coverage) -> list[float]:
@@ -133,6 +148,7 @@ def _gap(
     key: tuple[int, int] | int,
     lines: list[float],
     reach: tuple[float, float],
+    backwards: bool,
 ) -> Gap:
     width = seen.footprint_across
     wanted = (1 - ASKED_SIDE_OVERLAP) * width
@@ -144,9 +160,11 @@ def _gap(
         if key[0] > 0:
             low, high = lines[key[0] - 1], lines[key[1] - 1]
             between, apart = key, high - low
+            if backwards:
+                between = len(lines) - key[0], len(lines) + 1 - key[0]
         else:
             low, high = float(across.min()), float(across.max())
-        count = max(1, math.ceil((high - low) / wanted - 1e-6) - 1)
+        count = max(1, math.ceil((high - low) / wanted - SLACK) - 1)
         again = key[0] > 0 and high - low <= wanted * 1.05
     else:
         spread = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]

@@ -65,7 +65,8 @@ def look(path: Path) -> Look:
         with warnings.catch_warnings(), Pillow.open(path) as image:
             warnings.simplefilter("ignore")
             exposure = _exposure(image)
-            image.draft("L", (LOOKED_AT, LOOKED_AT))
+            share = LOOKED_AT / max(image.size)
+            image.draft("L", (round(image.width * share), round(image.height * share)))
             gray = np.asarray(image if image.mode == "L" else _gray(image))
     except (OSError, SyntaxError, ValueError, Pillow.DecompressionBombError) as error:
         return Look(error=str(error).split("\n")[0] or "cannot be decoded")
@@ -126,8 +127,8 @@ def _exposure(image: Image.Image) -> float | None:
 def _octaves(pixels: NDArray[np.float32], axis: int) -> float:
     """Energy of the finest octave over that of the fourth, along one axis; every third line is looked at.
 
-    Measured on four flights: no sharp image falls under 0.7 of its flight's median, a blur of 1.5 pixels lowers every
-    image under 0.4 of it, a motion of 3 pixels under 0.65, one of 6 pixels under 0.4.
+    Measured on four flights, in pixels as decoded: no sharp image falls under 0.7 of its flight's median, a blur of
+    1.5 pixels lowers every image under 0.4 of it, a motion of 3 pixels under 0.65, one of 6 pixels under 0.4.
     """
     import cv2
 

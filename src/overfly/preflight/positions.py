@@ -96,11 +96,13 @@ def off_track(xy: Array, seconds: Array | None = None) -> Array:
     """
     t = np.arange(len(xy), dtype=float) if seconds is None else seconds
     away = np.full((3, len(xy)), np.inf)
-    for i in range(len(xy)):
-        for row, (a, b) in enumerate(((i - 1, i + 1), (i - 2, i - 1), (i + 1, i + 2))):
-            if min(a, b) >= 0 and max(a, b) < len(xy) and t[b] > t[a]:
-                expected = xy[a] + (xy[b] - xy[a]) * (t[i] - t[a]) / (t[b] - t[a])
-                away[row, i] = float(np.linalg.norm(xy[i] - expected))
+    index = np.arange(len(xy))
+    for row, (before, after) in enumerate(((-1, 1), (-2, -1), (1, 2))):
+        i = index[(index + before >= 0) & (index + after < len(xy))]
+        a, b = i + before, i + after
+        share = (t[i] - t[a]) / (t[b] - t[a])
+        expected = xy[a] + (xy[b] - xy[a]) * share[:, None]
+        away[row, i] = np.linalg.norm(xy[i] - expected, axis=1)
     return np.asarray(away.min(0))
 
 
@@ -112,25 +114,47 @@ def _seconds(frames: Sequence[Frame]) -> Array | None:
     return seconds if np.all(np.diff(seconds) > 0) else None
 
 
+def strays(xy: Array, seconds: Array | None) -> list[tuple[int, float]]:
+    """Positions [n, 2] off the track and by how much, the worst first.
+
+    Near a wrong position right ones look wrong too: of it and its neighbours the one is meant without which the rest of
+    the track is smoothest. An error at a corner of the track towards the next line is a possible track and not told.
+    """
+
+    def away(kept: NDArray[np.int64]) -> Array:
+        by_order = off_track(xy[kept])
+        return by_order if seconds is None else np.minimum(by_order, off_track(xy[kept], seconds[kept]))
+
+    kept = np.arange(len(xy))
+    first = away(kept)
+    limit = max(OFF_TRACK, TIMES_USUAL * float(np.median(first)))
+    found: list[tuple[int, float]] = []
+    while len(kept) >= 6 and len(found) < len(xy) // 4:
+        now = away(kept)
+        worst = int(now.argmax())
+        if now[worst] <= limit:
+            break
+        near = kept[max(0, worst - 9) : worst + 10]
+        suspects = kept[max(0, worst - 2) : worst + 3].tolist()
+        left = [float(np.minimum(away(near[near != k]), 2 * limit).sum()) for k in suspects]
+        wrong = suspects[int(np.argmin(left))]
+        found.append((wrong, float(now[kept == wrong][0])))
+        kept = kept[kept != wrong]
+    return sorted(found, key=lambda entry: -entry[1])
+
+
 def _off_track(frames: Sequence[Frame], xy: Array) -> Iterator[Finding]:
-    if len(frames) < 6:
+    if len(frames) < 6 or not (found := strays(xy, _seconds(frames))):
         return
-    away = np.minimum(off_track(xy), off_track(xy, _seconds(frames)))
-    known = np.isfinite(away)
-    limit = max(OFF_TRACK, TIMES_USUAL * float(np.median(away[known])))
-    wrong = np.flatnonzero(known & (away > limit))
-    # Neighbours of a wrong position are expected at wrong places: the worst of each run of neighbours is meant.
-    wrong = np.array([i for i in wrong if away[i] == away[max(0, i - 2) : i + 3][known[max(0, i - 2) : i + 3]].max()])
-    if len(wrong):
-        names = [frames[i].name for i in wrong.tolist()]
-        yield Finding(
-            "warn",
-            "gps",
-            f"{count(len(wrong), 'GPS position')} up to {away[wrong].max():.0f} m off the track of the neighbours "
-            f"({some(names)})",
-            "correct or remove these positions (geo.txt, or images without GPS tags are placed by matching)",
-            tuple(names),
-        )
+    names = [frames[i].name for i, _ in found]
+    which = count(len(found), "GPS position")
+    yield Finding(
+        "warn",
+        "gps",
+        f"{which} up to {found[0][1]:.0f} m off the track of the neighbours ({some(names)})",
+        "correct or remove these positions (geo.txt, or images without GPS tags are placed by matching)",
+        tuple(names),
+    )
 
 
 def _heights(frames: Sequence[Frame]) -> Iterator[Finding]:

@@ -148,7 +148,8 @@ def _copies(flight: Flight, looks: Sequence[Look]) -> Iterator[Finding]:
         alone = len(looks) - len(copies) < 2
         text = f"{count(len(copies), 'image')} of {len(looks)} with the same pixels as another one ({some(copies)})"
         remedy = "one image alone gives no depth" if alone else "remove the copies; they add nothing"
-        yield Finding("stop" if alone else "warn", "duplicates", text, remedy, tuple(copies))
+        level = "stop" if alone else "bad" if 2 * len(copies) > len(looks) else "warn"
+        yield Finding(level, "duplicates", text, remedy, tuple(copies))
     if twins:
         text = f"{count(len(twins), 'image')} taken at the same place and time as another one ({some(twins)})"
         yield Finding("note", "duplicates", text, "remove edited versions of the same photograph", tuple(twins))
