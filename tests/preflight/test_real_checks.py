@@ -85,3 +85,14 @@ def test_kites_without_gps_are_checked_for_their_images_alone(shared_data, name)
     assert place(flight, looks, None) is None
     assert "None of the" in str(next(iter(position_findings(flight, None))))
     assert all(one.flat < 0.3 for one in looks[:4])
+
+
+def test_cameras_of_a_frame_of_their_own_give_way_to_gps(shared_data, tmp_path):
+    root = shared_data("brighton_beach")
+    (tmp_path / "images").symlink_to(root / "images")
+    (tmp_path / "sparse").symlink_to(root / "reference_colmap")
+    flight = read_flight(tmp_path)
+    assert flight.cameras_from == "sparse"
+    placed = place(flight, [Look()] * len(flight), None)
+    assert placed.metric
+    assert placed.heights == pytest.approx(40, abs=0.5)

@@ -91,13 +91,20 @@ def shifts_of(looks: Sequence[Look]) -> Shifts:
 def place(flight: Flight, looks: Sequence[Look], altitude: float | None) -> Placement | None:
     """Put the cameras over the ground; None where neither cameras nor GPS positions are known.
 
+    Given cameras in metres are taken first, then GPS, then given cameras of unknown scale that look down.
+
     Args:
         flight: its frames, in parallel with ``looks``.
         looks: at the images.
         altitude: metres over ground that the user states, or None.
     """
-    if flight.cameras_from is not None:
-        return _given(flight, altitude)
+    given = _given(flight, altitude) if flight.cameras_from is not None else None
+    if given is not None and given.metric:
+        return given
+    return _by_gps(flight, looks, altitude) or given
+
+
+def _by_gps(flight: Flight, looks: Sequence[Look], altitude: float | None) -> Placement | None:
     known = [i for i, f in enumerate(flight.frames) if f.gps is not None]
     origin = flight.gps_origin()
     if len(known) < 2 or origin is None:
@@ -202,6 +209,8 @@ def _given(flight: Flight, altitude: float | None) -> Placement | None:
         except InputError:
             return None
         how = "by a first look at a few pairs of images: sure to about a tenth of the height"
+    if ground >= middle or np.median(poses[:, 2, 2]) > -0.2:
+        return None  # a frame of its own, in which z is not up
     unit = "m" if metric else "units"
     assumed = f"Cameras of {flight.cameras_from}; level ground {middle - ground:.3g} {unit} below them, {how}."
     return Placement(frames, cameras, poses, ground, flight.origin, metric, assumed)

@@ -36,7 +36,7 @@ def position_findings(flight: Flight, placed: Placement | None) -> Iterator[Find
         if flight.cameras_from is None:
             yield from _off_track(frames, xy)
     yield from _heights(flight.frames)
-    if placed is not None and flight.cameras_from is None:
+    if placed is not None:
         yield from _altitude(placed)
 
 
