@@ -15,8 +15,8 @@ from overfly.preflight.ground import Placement, positions
 OFF_TRACK = 8.0
 """Metres: less than this off the track is within what receivers without RTK do."""
 
-HEIGHT_JUMP = 8.0
-"""Metres between an image and its neighbours in the flight."""
+HEIGHT_JUMP = 12.0
+"""Metres between an image and its neighbours in the flight; receivers without RTK wander by less."""
 
 TIMES_USUAL = 6.0
 """An outlier is this many times further off than the flight's images usually are."""
@@ -168,8 +168,7 @@ def _heights(frames: Sequence[Frame]) -> Iterator[Finding]:
         jumps = _jumps(height)
         if len(jumps):
             names = [frames[i].name for i in jumps]
-            usual = float(np.nanmedian(height))
-            worst = float(np.max(np.abs(height[jumps] - usual)))
+            worst = max(jumps.values())
             yield Finding(
                 "warn",
                 "altitude",
@@ -187,8 +186,8 @@ def _heights(frames: Sequence[Frame]) -> Iterator[Finding]:
             )
 
 
-def _jumps(height: Array) -> NDArray[np.int64]:
-    """Images whose height differs from the median of the two before and the two after, all of them alike."""
+def _jumps(height: Array) -> dict[int, float]:
+    """Images whose height differs from the two before and the two after, all of them alike, and by how much."""
     away = np.zeros(len(height))
     for i in range(len(height)):
         around = np.concatenate([height[max(0, i - 2) : i], height[i + 1 : i + 3]])
@@ -196,7 +195,7 @@ def _jumps(height: Array) -> NDArray[np.int64]:
         if len(around) >= 2 and np.isfinite(height[i]) and np.ptp(around) < HEIGHT_JUMP:
             away[i] = abs(height[i] - np.median(around))
     usual = float(np.median(away))
-    return np.flatnonzero(away > max(HEIGHT_JUMP, TIMES_USUAL * usual))
+    return {i: float(away[i]) for i in np.flatnonzero(away > max(HEIGHT_JUMP, TIMES_USUAL * usual)).tolist()}
 
 
 def _altitude(placed: Placement) -> Iterator[Finding]:
