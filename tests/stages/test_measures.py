@@ -120,6 +120,14 @@ def test_pairs_of_one_scene_in_other_windows_are_neither_positive_nor_negative()
     assert negative[:4, 4:].all()
 
 
+def test_frames_of_a_window_that_share_no_ground_are_negatives() -> None:
+    batch = make_batch(windows=1, frames=3)
+    batch["overlaps"] = torch.tensor([[[1.0, 0.4, 0.3], [0.4, 1.0, 0.0], [0.3, 0.0, 1.0]]])
+    positive, negative = overlapping(batch)
+    assert positive.tolist() == [[False, True, True], [True, False, False], [True, False, False]]
+    assert negative.tolist() == [[False, False, False], [False, False, True], [False, True, False]]
+
+
 def test_correction_errors_in_metres_and_degrees() -> None:
     batch = make_batch(2)
     batch["prior_from_window"] = batch["camera_from_window"].clone()

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from overfly.errors import InputError
 from overfly.networks.blocks import ConvolutionBlock, Part, ResidualBlock
+from overfly.networks.heads import OwnHeads, Pyramid
 from overfly.networks.poses import relative
 
 STRIDE = 16
@@ -31,12 +32,15 @@ class DenseMaps(NamedTuple):
     """What the encoder knows about the places in M images.
 
     Attributes:
-        match_map: [M, C, H / 2, W / 2], unit vectors; cell (row, column) is centred on pixel (2 column + 1, 2 row + 1).
+        compared: [M, C, H / 2, W / 2], unit vectors, which a sweep compares; cell (row, column) is centred on pixel
+            (2 column + 1, 2 row + 1).
         context: [M, C, H / 4, W / 4]: what a place is, with its surroundings.
+        match_map: as ``compared``, for key points and correspondences; the same map without heads of their own.
     """
 
-    match_map: Tensor
+    compared: Tensor
     context: Tensor
+    match_map: Tensor
 
 
 class Encoded(NamedTuple):
@@ -68,6 +72,8 @@ class Encoder(Part):
     - *Max-pooling and fully connected*: the last map is max-pooled 2 x 2 and, positions kept, goes through one fully
       connected layer to the DFV.
     - *Image retrieval layer*: a fully connected layer from the DFV to a normalised global descriptor.
+    - With ``own_heads`` matching and retrieval read the blocks' outputs through layers of their own instead
+      (:class:`overfly.networks.heads.OwnHeads`).
     - *Geometric correction*: the pooled maps of a frame and of its window's reference frame and the prior relative pose
       go through two fully connected layers to a motion that corrects the prior (rotation vector, translation).
 
@@ -78,6 +84,7 @@ class Encoder(Part):
         descriptor: size of the global descriptor.
         match_channels: size of the match map's descriptors.
         correction_width: width of the correction's hidden layer.
+        own_heads: whether matching and retrieval have maps of their own.
 
     Raises:
         InputError: the image size is not a multiple of 32, or there are not four widths.
@@ -92,6 +99,7 @@ class Encoder(Part):
         descriptor: int,
         match_channels: int,
         correction_width: int,
+        own_heads: bool = False,
     ) -> None:
         super().__init__()
         width, height = size
@@ -106,11 +114,13 @@ class Encoder(Part):
         self.stem = ConvolutionBlock(inputs=3, outputs=widths[0], kernel=5, stride=2)
         self.blocks = nn.ModuleList(ResidualBlock(width=w) for w in widths)
         self.downsampling = nn.ModuleList(ConvolutionBlock(inputs=a, outputs=b, stride=2) for a, b in pairwise(widths))
-        self.lateral = nn.ModuleList(nn.Conv2d(w, match_channels, 1) for w in widths[:3])
-        self.context = ConvolutionBlock(inputs=match_channels, outputs=match_channels)
+        self.pyramid = Pyramid(widths=widths[:3], channels=match_channels)
         pooled = widths[3] * (width // 32) * (height // 32)
         self.feature_head = nn.Sequential(nn.Linear(pooled, features), nn.PReLU())
-        self.retrieval_head = nn.Linear(features, descriptor)
+        self.own_heads = (
+            OwnHeads(widths=widths[:3], channels=match_channels, descriptor=descriptor) if own_heads else None
+        )
+        self.retrieval_head = None if own_heads else nn.Linear(features, descriptor)
         last = nn.Linear(correction_width, 6)
         self.correction_head = nn.Sequential(nn.Linear(2 * pooled + 12, correction_width), nn.PReLU(), last)
         with torch.no_grad():  # no correction is the best first guess
@@ -128,12 +138,22 @@ class Encoder(Part):
         maps = self._maps(images, 4)
         pooled = F.max_pool2d(maps[3], 2).flatten(1)
         features = self.feature_head(pooled)
-        dense = self._dense(maps[:3])
-        return Encoded(dense.match_map, pooled, features, F.normalize(self.retrieval_head(features), dim=1))
+        if self.own_heads is not None:
+            match_map, descriptor = self.own_heads(maps[:3])
+        else:
+            assert self.retrieval_head is not None
+            match_map, descriptor = self.pyramid(maps[:3])[0], F.normalize(self.retrieval_head(features), dim=1)
+        return Encoded(match_map, pooled, features, descriptor)
 
-    def dense(self, images: Tensor) -> DenseMaps:
-        """The dense maps alone, of M images [M, 3, H, W] in 0..1 of any size whose sides are multiples of 8."""
-        return self._dense(self._maps(images, 3))
+    def dense(self, images: Tensor, *, matching: bool = True) -> DenseMaps:
+        """The dense maps alone, of M images [M, 3, H, W] in 0..1 of any size whose sides are multiples of 8.
+
+        Without ``matching`` the match map is not computed; ``compared`` stands in its place.
+        """
+        maps = self._maps(images, 3)
+        compared, context = self.pyramid(maps)
+        match_map = self.own_heads(maps)[0] if matching and self.own_heads is not None else compared
+        return DenseMaps(compared, context, match_map)
 
     def _maps(self, images: Tensor, blocks: int) -> list[Tensor]:
         """The outputs of the first residual blocks."""
@@ -143,12 +163,6 @@ class Encoder(Part):
             x = block(down(x))
             maps.append(x)
         return maps
-
-    def _dense(self, maps: list[Tensor]) -> DenseMaps:
-        fine, middle, coarse = (layer(level) for layer, level in zip(self.lateral, maps, strict=True))
-        context = self.context(F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False) + middle)
-        wide = F.interpolate(context, scale_factor=2, mode="bilinear", align_corners=False)
-        return DenseMaps(F.normalize(wide + fine, dim=1), context)
 
     def correction(self, pooled: Tensor, prior_from_window: Tensor) -> Tensor:
         """The geometric correction of each frame's prior pose relative to the reference frame.

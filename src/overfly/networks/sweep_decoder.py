@@ -56,8 +56,8 @@ class SweepDecoder(nn.Module):
                 by which the frames are aligned; with ``depth``, the aligned depth is returned too.
 
         Returns:
-            ``features``, ``descriptor``, ``correction`` as ``GanDecoder.encode``; ``match_map`` [B, K, C, h, w] of the
-            aligned frames; ``match_depth`` and ``match_intrinsics``, by which these can be judged.
+            ``features``, ``descriptor``, ``correction`` as ``GanDecoder.encode``; ``match_map`` and ``compared``
+            [B, K, C, h, w] of the aligned frames; ``match_depth`` and ``match_intrinsics``, by which these are judged.
         """
         images, intrinsics = self._octaves(batch["images"], batch["intrinsics"])[0]
         windows = images.shape[:2]
@@ -69,6 +69,7 @@ class SweepDecoder(nn.Module):
             "features": encoded.features.unflatten(0, windows),
             "descriptor": encoded.descriptor.unflatten(0, windows),
             "correction": self.encoder.correction(pooled, batch["prior_from_window"]),
+            "compared": maps.compared.unflatten(0, windows),
             **self._judged(maps.match_map.unflatten(0, windows), aligned, batch),
         }
 
@@ -112,10 +113,10 @@ class SweepDecoder(nn.Module):
         with torch.no_grad():
             aligned = align(images, intrinsics, poses)
         windows = images.shape[:2]
-        maps = self.encoder.dense(aligned.images.flatten(0, 1))
-        match = maps.match_map.unflatten(0, windows)
+        maps = self.encoder.dense(aligned.images.flatten(0, 1), matching=False)
+        compared = maps.compared.unflatten(0, windows)
         context = maps.context.unflatten(0, windows)[:, 0]
-        return Level(aligned.size, match, context, aligned.intrinsics, intrinsics, poses)
+        return Level(aligned.size, compared, context, aligned.intrinsics, intrinsics, poses)
 
     def _judged(self, match: Tensor, aligned: Aligned, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         judged = {"match_map": match, "match_intrinsics": aligned.intrinsics}

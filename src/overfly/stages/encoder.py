@@ -29,7 +29,7 @@ class EncoderStage(Stage):
         others: see :class:`overfly.stages.stage.Stage`.
     """
 
-    terms = ("correspondence", "retrieval", "correction")
+    terms = ("correspondence", "matching", "retrieval", "correction")
 
     def __init__(self, *, pixels: int, keypoints: int, **others: Any) -> None:
         super().__init__(**others)

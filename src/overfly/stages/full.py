@@ -23,7 +23,7 @@ class FullStage(GanStage):
         others: see :class:`overfly.stages.gan.GanStage`.
     """
 
-    terms: ClassVar[tuple[str, ...]] = (*GanStage.terms, "correspondence", "retrieval", "correction")
+    terms: ClassVar[tuple[str, ...]] = (*GanStage.terms, "correspondence", "matching", "retrieval", "correction")
     accuracy: ClassVar[str] = "near_2pct"
     loss: ClassVar[str] = "loss_generator"
 

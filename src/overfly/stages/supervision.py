@@ -28,7 +28,8 @@ def encoder_terms(
     """The encoder's loss terms, means over what can be judged.
 
     Args:
-        output: of the network: ``match_map``, ``descriptor``, ``correction``.
+        output: of the network: ``match_map``, ``descriptor``, ``correction``; ``compared`` where a sweep compares
+            another map than the match map.
         batch: of windows.
         names: the terms that are asked for.
         pixels: number of correspondences drawn per pair of frames.
@@ -39,7 +40,10 @@ def encoder_terms(
     """
     names, terms = set(names), {}
     if "correspondence" in names:
-        terms["correspondence"] = _correspondence(output, batch, pixels, random)
+        compared = output.get("compared", output["match_map"])
+        terms["correspondence"] = _correspondence(compared, output, batch, pixels, random)
+    if "matching" in names and "compared" in output:
+        terms["matching"] = _correspondence(output["match_map"], output, batch, pixels, random)
     if "retrieval" in names:
         positive, negative = overlapping(batch)
         values = losses.retrieval(output["descriptor"].flatten(0, 1), positive, negative)
@@ -55,11 +59,14 @@ def encoder_terms(
 def overlapping(batch: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
     """Which pairs of the batch's B K frames see common ground, and which surely do not, both [B K, B K].
 
-    Windows of one scene may overlap each other by an unknown amount: such pairs are neither.
+    Windows of one scene may overlap each other by an unknown amount: such pairs are neither. Two frames of a window
+    that share nothing are the hardest negatives: the same landscape in the same light.
     """
-    common = (batch["overlaps"] > 0) & ~repeated(batch)
+    same = repeated(batch)
+    common, apart = (batch["overlaps"] > 0) & ~same, (batch["overlaps"] <= 0) & ~same
+    positive, elsewhere = (torch.block_diag(*x.to(torch.uint8)).bool() for x in (common, apart))
     frame_scene = batch["scene"].repeat_interleave(common.shape[1])
-    return torch.block_diag(*common.to(torch.uint8)).bool(), frame_scene[:, None] != frame_scene[None]
+    return positive, (frame_scene[:, None] != frame_scene[None]) | elsewhere
 
 
 def repeated(batch: Mapping[str, Tensor]) -> Tensor:
@@ -117,9 +124,9 @@ def correction_errors(output: Mapping[str, Tensor], batch: Mapping[str, Tensor])
 
 
 def _correspondence(
-    output: Mapping[str, Tensor], batch: Mapping[str, Tensor], count: int, random: torch.Generator
+    match_map: Tensor, output: Mapping[str, Tensor], batch: Mapping[str, Tensor], count: int, random: torch.Generator
 ) -> Tensor:
-    match_map, cameras = output["match_map"], match_cameras(output, batch)
+    cameras = match_cameras(output, batch)
     b, k, _, h, w = match_map.shape
     places = cell_pixels(h, w, MATCH_STRIDE, match_map.device).expand(b, -1, -1)
     same = repeated(batch)
