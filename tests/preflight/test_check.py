@@ -24,7 +24,7 @@ from overfly.preflight.gaps import gaps_of
 from overfly.preflight.ground import lines_of, place
 from overfly.preflight.images import look, look_at_all
 from overfly.preflight.positions import off_track, position_findings
-from overfly.preflight.quality import camera_findings
+from overfly.preflight.quality import camera_findings, image_findings
 
 
 @pytest.fixture(scope="module")
@@ -189,6 +189,16 @@ def test_missing_and_stuck_gps(flight):
     assert "no metric scale" in str(faulty(flight, nowhere)[0])
 
 
+def test_positions_in_the_images_are_no_fault_where_cameras_are_given(flight):
+    here = flight.frames[0].gps
+    stuck = [replace(f, gps=here) for f in flight.frames]
+    jumping = [moved(replace(f, relative_altitude=ALTITUDE + 90 * (i == 5)), up=90 * (i == 9)) for i, f in
+               enumerate(flight.frames)]  # fmt: skip
+    for frames in (stuck, jumping):
+        assert list(position_findings(replace(flight, frames=frames), None))
+        assert list(position_findings(replace(flight, frames=frames, cameras_from="transforms.json"), None)) == []
+
+
 def test_corners_of_the_track_are_no_faults():
     assert off_track(grid()) == pytest.approx(0)
 
@@ -249,6 +259,22 @@ def test_image_faults_are_named(tmp_path):
     assert "broken.jpg" in str(about(found.findings, "files")[0])
 
 
+@pytest.mark.parametrize(("whole", "level"), [(0, "stop"), (1, "stop"), (2, "bad")])
+def test_less_than_two_images_that_can_be_decoded_give_no_map(flight, looks, tmp_path, whole, level):
+    absent = look(tmp_path / "absent.jpg")
+    some_looks = [one if i < whole else absent for i, one in enumerate(looks)]
+    (finding,) = about(image_findings(flight, some_looks, None), "files")
+    assert finding.level == level
+    assert len(finding.images) == len(flight) - whole
+
+
+def test_images_of_which_none_can_be_decoded_give_no_map(tmp_path):
+    root = write(tmp_path / "flight", grid((0,)))
+    for path in root.glob("*.jpg"):
+        path.write_bytes(path.read_bytes().replace(b"\xff\xdb", b"\xff\xee"))  # no quantisation tables
+    assert not check_flight(root).mappable
+
+
 def test_copies_of_one_image_and_water_give_no_map(tmp_path):
     root = tmp_path / "flight"
     write(root, grid()[:1])
@@ -282,8 +308,6 @@ def test_mixed_cameras_focal_lengths_and_orientation(tmp_path, flight):
 
 
 def test_motion_during_the_exposure():
-    from overfly.preflight.quality import image_findings
-
     class Empty:
         frames: tuple = ()
         skipped: tuple = ()
@@ -313,6 +337,30 @@ def test_given_cameras_are_used(tmp_path, good, looks):
     found = check_flight(root)
     assert "transforms.json" in found.placed.assumed
     assert found.to_dict()["overlap"]["forward"] == pytest.approx(0.8, abs=0.01)
+
+
+def test_an_altitude_without_use_is_said(flight, looks):
+    down = place(flight, looks, None).poses
+    frames = [replace(f, camera=CAMERA, world_from_camera=p, gps=None) for f, p in zip(flight.frames, down)]
+    facts = {"scale": "unknown", "ground_height": 0.0}
+    unscaled = replace(flight, frames=frames, cameras_from="sparse/0", origin=None, facts=facts)
+    placed = place(unscaled, looks, 30.0)
+    assert placed.heights == pytest.approx(ALTITUDE, abs=0.01)
+    assert placed.assumed.endswith(" --altitude is not used, because the scale of these cameras is unknown.")
+    assert "--altitude" not in place(unscaled, looks, None).assumed
+
+
+def test_cameras_that_see_no_ground_are_not_asked_for_their_height(good, flight, monkeypatch):
+    up = replace(flight, frames=[replace(f, gimbal=(0.0, 40.0, 0.0)) for f in flight.frames])
+    monkeypatch.setattr("overfly.preflight.check.read_flight", lambda folder: up)
+    found = check_flight(good)
+    assert found.placed is not None
+    assert found.seen is None
+    (finding,) = about(found.findings, "overlap")
+    assert str(finding).startswith("No camera sees the ground, so overlap on level ground cannot be told: ")
+    assert not any("--altitude" in str(f) for f in found.findings)
+    with pytest.raises(InputError, match="no camera sees the ground"):
+        found.picture()
 
 
 def test_command_writes_json_and_picture(tmp_path, good, monkeypatch, capsys):

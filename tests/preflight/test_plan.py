@@ -16,7 +16,7 @@ from overfly.flights import camera_preset
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.preflight.area import read_area
 from overfly.preflight.plan import LOOKED_AT, plan_area
-from overfly.preflight.waypoints import LITCHI_COLUMNS, MOST_WAYPOINTS
+from overfly.preflight.waypoints import LITCHI_COLUMNS, MOST_WAYPOINTS, Waypoint, write_litchi
 
 KML = "{http://www.opengis.net/kml/2.2}"
 ZURICH = Origin(47.37, 8.54)
@@ -180,6 +180,26 @@ def test_long_missions_take_photographs_by_distance(tmp_path):
     intervals = [float(r["photo_distinterval"]) for r in rows]
     assert intervals[::2] == pytest.approx([planned.plan.step_m] * planned.lines, abs=0.01)
     assert set(intervals[1::2]) == {-1}
+
+
+def test_every_line_of_a_long_mission_is_photographed(tmp_path):
+    """Lines of one image take it at their only waypoint, and no cut parts the two ends of a line."""
+    counts = [3, 1, *[4] * 48, 1, 1, 2, *[5] * 60]
+    points = [
+        Waypoint(46 + i * 1e-4, 8 + line * 1e-4, 60, 0, -90, line) for line, n in enumerate(counts) for i in range(n)
+    ]
+    files = write_litchi(tmp_path / "long.csv", points, speed=5, step_m=12)
+    assert [f.name for f in files] == ["long_1.csv", "long_2.csv", "long_3.csv"]
+    flown = []
+    for file in files:
+        rows = read_litchi(file)
+        assert len(rows) <= MOST_WAYPOINTS
+        lines = [round((float(row["longitude"]) - 8) * 1e4) for row in rows]
+        for line in dict.fromkeys(lines):
+            own = [(row["actiontype1"], row["photo_distinterval"]) for row, of in zip(rows, lines) if of == line]
+            assert own == ([("1", "-1")] if counts[line] == 1 else [("-1", "12.00"), ("-1", "-1")])
+            flown.append(line)
+    assert flown == list(range(len(counts)))
 
 
 def test_long_orbits_become_several_missions(tmp_path):

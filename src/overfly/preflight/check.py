@@ -36,7 +36,8 @@ class Check:
 
     Attributes:
         flight, looks: the images and the look at each.
-        placed, seen: cameras over the ground and what they see; None where positions or height are not known.
+        placed: cameras over the ground; None where positions or height are not known.
+        seen: what they see; None where nothing is placed or no camera sees the ground.
         gaps: ground that needs more lines.
         findings: worst first.
         motion_px: way of the drone during an exposure, pixels on the ground.
@@ -143,6 +144,8 @@ class Check:
         """
         from overfly.mapping.pictures import png, views_map
 
+        if self.placed is not None and self.seen is None:
+            raise InputError("There is no overlap map, because no camera sees the ground: leave --picture out.")
         if self.placed is None or self.seen is None:
             raise InputError(
                 "There is no overlap map without positions: give GPS in the images, a geo.txt or cameras, and "
@@ -194,6 +197,15 @@ def check_flight(
     findings = [*position_findings(flight, placed)]
     if placed is not None and seen is not None:
         findings += overlap_findings(placed, seen, gaps)
+    elif placed is not None:
+        findings.append(
+            Finding(
+                "warn",
+                "overlap",
+                "No camera sees the ground, so overlap on level ground cannot be told",
+                "a map needs views from above; if the images are such, their gimbal angles or heights are wrong",
+            )
+        )
     elif flight.cameras_from is not None or any(f.gps is not None for f in flight.frames):
         findings.append(
             Finding(

@@ -213,6 +213,8 @@ def _given(flight: Flight, altitude: float | None) -> Placement | None:
         return None  # a frame of its own, in which z is not up
     unit = "m" if metric else "units"
     assumed = f"Cameras of {flight.cameras_from}; level ground {middle - ground:.3g} {unit} below them, {how}."
+    if altitude is not None and not metric:
+        assumed += " --altitude is not used, because the scale of these cameras is unknown."
     return Placement(frames, cameras, poses, ground, flight.origin, metric, assumed)
 
 

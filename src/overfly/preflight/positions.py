@@ -28,14 +28,14 @@ DISAGREE = 0.25
 def position_findings(flight: Flight, placed: Placement | None) -> Iterator[Finding]:
     """What is wrong with the positions; cameras that the folder gives are taken as right."""
     yield from _missing(flight)
-    frames = [f for f in flight.frames if f.gps is not None]
-    origin = flight.gps_origin()
-    if len(frames) >= 2 and origin is not None:
-        xy = positions(frames, origin)
-        yield from _stuck(frames, xy)
-        if flight.cameras_from is None:
+    if flight.cameras_from is None:
+        frames = [f for f in flight.frames if f.gps is not None]
+        origin = flight.gps_origin()
+        if len(frames) >= 2 and origin is not None:
+            xy = positions(frames, origin)
+            yield from _stuck(frames, xy)
             yield from _off_track(frames, xy)
-    yield from _heights(flight.frames)
+        yield from _heights(flight.frames)
     if placed is not None:
         yield from _altitude(placed)
 

@@ -62,8 +62,10 @@ def image_findings(flight: Flight, looks: Sequence[Look], motion_px: float | Non
         text = f"{count(len(flight.skipped), 'file')} cannot be read ({some(flight.skipped)})"
         yield Finding("warn", "files", text, "copy them again from the card", tuple(flight.skipped))
     if broken := those([look.error is not None for look in looks]):
-        text = f"{count(len(broken), 'image')} cannot be decoded ({some(broken)})"
-        yield Finding("bad", "files", text, "copy them again from the card or remove them", broken)
+        few = len(names) - len(broken) < 2
+        text = f"{count(len(broken), 'image')} of {len(names)} cannot be decoded ({some(broken)})"
+        remedy = "copy them again from the card" + ("; a map needs two at least" if few else " or remove them")
+        yield Finding("stop" if few else "bad", "files", text, remedy, broken)
     with np.errstate(invalid="ignore"):
         blurred = those(relative_sharpness(flight, looks) < BLURRED)
     if blurred:

@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -70,6 +71,17 @@ def line_ends(points: Sequence[Waypoint]) -> list[Waypoint]:
     return [points[i] for pair in zip(first, last) for i in dict.fromkeys(pair)]
 
 
+def _whole_lines(ends: Sequence[Waypoint]) -> list[list[Waypoint]]:
+    """Missions that fit: a cut between the two ends of a line would leave it without photographs."""
+    pieces: list[list[Waypoint]] = [[]]
+    for _, line in groupby(ends, key=lambda point: point.line):
+        group = list(line)
+        if len(pieces[-1]) + len(group) > MOST_WAYPOINTS:
+            pieces.append([])
+        pieces[-1] += group
+    return pieces
+
+
 def write_kml(path: Path, points: Sequence[Waypoint], name: str, outline: Array | None = None) -> None:
     """The track as a line, every photograph as a placemark; heights relative to the ground.
 
@@ -116,15 +128,17 @@ def write_litchi(path: Path, points: Sequence[Waypoint], *, speed: float, step_m
     """Litchi's CSV: heights above ground, the gimbal turned from waypoint to waypoint.
 
     Up to :data:`MOST_WAYPOINTS` photographs are waypoints, each with the action to take one. Longer flights along lines
-    have their ends as waypoints and take photographs every ``step_m``; what is still too long, or a flight without
-    lines, is cut into several missions, name_1.csv, name_2.csv, ...
+    have their ends as waypoints and take photographs every ``step_m``, a line of one photograph takes it there; what is
+    still too long is cut between lines, or anywhere in a flight without them, into missions name_1.csv, name_2.csv, ...
 
     Returns:
         The files written.
     """
     by_distance = len(points) > MOST_WAYPOINTS and step_m is not None
-    chosen = line_ends(points) if by_distance else list(points)
-    pieces = [chosen[i : i + MOST_WAYPOINTS - by_distance] for i in range(0, len(chosen), MOST_WAYPOINTS - by_distance)]
+    if by_distance:
+        pieces = _whole_lines(line_ends(points))
+    else:
+        pieces = [list(points[i : i + MOST_WAYPOINTS]) for i in range(0, len(points), MOST_WAYPOINTS)]
     names = [path] if len(pieces) == 1 else [path.with_stem(f"{path.stem}_{k + 1}") for k in range(len(pieces))]
     for name, piece in zip(names, pieces, strict=True):
         buffer = io.StringIO()
@@ -132,8 +146,9 @@ def write_litchi(path: Path, points: Sequence[Waypoint], *, speed: float, step_m
         writer.writerow(LITCHI_COLUMNS)
         for i, point in enumerate(piece):
             on_line = by_distance and i + 1 < len(piece) and piece[i + 1].line == point.line
+            alone = by_distance and sum(p.line == point.line for p in piece) == 1
             actions = [NO_ACTION, 0] * ACTIONS
-            if not by_distance:
+            if not by_distance or alone:
                 actions[:2] = TAKE_PHOTO, 0
             interval = f"{step_m:.2f}" if on_line and step_m is not None else "-1"
             writer.writerow(
