@@ -60,7 +60,7 @@ def main() -> None:
 
 def refine(out: Path, scene: str, path: str, seed: int, variant: str, more: Iterable[str]) -> None:
     """One cell, unless it is there already; all variants of a flight share its photographs and rough mesh."""
-    folder = out / f"{scene}-{path}-{seed}-{variant}"
+    folder = out / f"{scene}-{path}-{seed}-{variant}"  # for other overrides give another --out
     if (folder / "seconds.txt").is_file():
         return
     print(folder.name, flush=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +19,7 @@ from overfly.mesh import Mesh, read_mesh, write_mesh
 from overfly.refine import refine
 from overfly.refinement.colors import colors_from
 from overfly.refinement.measure import ShapeMeasure
-from overfly.refinement.module import with_area
+from overfly.refinement.module import welded, with_area
 from overfly.rendering import topology
 from photographed import SHIFT, Photographed, color, flat_mesh, height, make_photographed, moved
 
@@ -98,6 +100,45 @@ def test_a_folder_of_other_things_is_left_alone(run: Refine, tmp_path: Path) -> 
         with pytest.raises(InputError, match="is not empty and holds no refinement"):
             run(overwrite=overwrite)
     assert (tmp_path / "out" / "thesis.txt").is_file()
+
+
+def test_other_photographs_under_the_same_names_are_another_refinement(
+    run: Refine, tmp_path: Path, given: Photographed
+) -> None:
+    flight = tmp_path / "flight"
+    shutil.copytree(given.flight, flight)
+    assert run(flight=flight) == 0
+    touched = next(flight.rglob("*.png"), None) or next(flight.rglob("*.jpg"))
+    os.utime(touched, ns=(1, 1))
+    with pytest.raises(InputError, match="holds another refinement"):
+        run(flight=flight)
+    inside = tmp_path / "out" / "flight"
+    shutil.copytree(given.flight, inside)
+    with pytest.raises(InputError, match="which --overwrite would delete"):
+        run(flight=inside, overwrite=True)
+    assert inside.is_dir()
+
+
+def test_a_run_of_another_stage_is_never_replaced(run: Refine, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "overrides.txt").write_text("experiment=overfly_base\n")
+    with pytest.raises(InputError, match="is a run of another stage"):
+        run(overwrite=True)
+
+
+def test_vertices_at_one_place_become_one() -> None:
+    mesh = flat_mesh()
+    soup = Mesh(
+        mesh.vertices[mesh.faces.reshape(-1)],
+        np.arange(mesh.faces.size, dtype=np.int32).reshape(-1, 3),
+        None if mesh.colors is None else mesh.colors[mesh.faces.reshape(-1)],
+    )
+    joined = welded(soup)
+    assert len(joined.vertices) == len(mesh.vertices)
+    assert (topology(joined.faces, len(joined.vertices)).neighbours >= 0).sum() == (
+        topology(mesh.faces, len(mesh.vertices)).neighbours >= 0
+    ).sum()
+    assert np.array_equal(joined.vertices[joined.faces], mesh.vertices[mesh.faces])
 
 
 def broken(kind: str) -> Mesh:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 from overfly.errors import InputError, unknown
+from overfly.mapping.steps import fingerprint
 from overfly.run_folder import quoted
 
 GENERATORS = {"vertices": "free_vertices", "network": "mesh_generator"}
@@ -70,20 +72,40 @@ def refine(
         *([] if adversarial is None else [f"loss.adversarial={adversarial}"]),
         *more,
     ]
+    seen = _inputs(flight, mesh, out)
     recorded = out / "overrides.txt"
     if recorded.is_file():
         before = [line for line in recorded.read_text().splitlines() if line and not line.startswith(_OWN)]
-        if before == asked:
+        if "stage=ssgan3d" not in before:
+            raise InputError(f"{out} is a run of another stage: give a new folder as --out.")
+        same = before == asked and (out / INPUTS).is_file() and json.loads((out / INPUTS).read_text()) == seen
+        if same and not overwrite:
             return main([f"resume={out}"])
         if overwrite:
+            for given in (flight, mesh):
+                if given is not None and given.resolve().is_relative_to(out.resolve()):
+                    raise InputError(f"{given} lies in {out}, which --overwrite would delete: give another --out.")
             shutil.rmtree(out)
         elif (out / "checkpoints" / "last.ckpt").is_file():
             raise InputError(
                 f"{out} holds another refinement (other photographs or settings): give another --out, or --overwrite."
             )
-    elif out.is_dir() and any(out.iterdir()):
+    elif out.is_dir() and any(path.name != INPUTS for path in out.iterdir()):
         raise InputError(f"{out} is not empty and holds no refinement: give a new folder as --out.")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / INPUTS).write_text(json.dumps(seen))
     return main([*asked, f"hydra.run.dir={quoted(out)}"])
+
+
+INPUTS = "inputs.json"
+"""What the photographs and the mesh were, so that others under the same names are not taken for them."""
+
+
+def _inputs(flight: Path, mesh: Path | None, out: Path) -> list[list[str | int]]:
+    """Name, size and time of every file of the flight, and of the mesh."""
+    files = [path for path in flight.rglob("*") if path.is_file() and not path.resolve().is_relative_to(out.resolve())]
+    files += [mesh] if mesh is not None and mesh.is_file() else []
+    return [list(facts) for facts in fingerprint(files)]
 
 
 _OWN = ("hydra.run.dir=", "resume=")

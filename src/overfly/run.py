@@ -125,7 +125,11 @@ def _train_stage(cfg: DictConfig) -> float | None:
             log.info("%s: finished before, its results in %s are kept", cfg.stage_name, run_dir)
             kept: float | None = json.loads(done.read_text()).get("monitored")
             return kept
+        if resume_from and not metrics:  # it was killed between its last epoch and this
+            metrics = _merged(trainer.validate(stage, datamodule=data, verbose=False))
         best, monitored = _best(trainer, cfg.monitor, metrics)
+        if getattr(stage, "delivers_last", False):
+            monitored = metrics.get(cfg.monitor, monitored)
         if cfg.test and data.has_test:
             results = trainer.test(stage, datamodule=data, ckpt_path=best, verbose=False, weights_only=True)
             metrics |= _merged(results)
@@ -141,7 +145,8 @@ def _train_stage(cfg: DictConfig) -> float | None:
                 },
             )
         shown = "was not measured" if monitored is None else f"is {monitored:.5g}"
-        log.info("%s: the best %s %s", cfg.stage_name, cfg.monitor, shown)
+        which = "last" if getattr(stage, "delivers_last", False) else "best"
+        log.info("%s: the %s %s %s", cfg.stage_name, which, cfg.monitor, shown)
         return monitored
     finally:
         finish_loggers(loggers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from overfly.errors import InputError
 from overfly.mesh import read_mesh
 from overfly.networks import FreeVertices, MeshGenerator
 from overfly.rendering import Views
@@ -191,6 +193,34 @@ def test_resuming_a_finished_run_keeps_its_results(train: Train, finished: Path)
     assert [(finished / name).read_bytes() for name in names] == before
     assert read_rows(finished / "metrics.csv") == rows
     assert "ssgan3d: finished before" in (finished / "train.log").read_text()
+
+
+def test_a_run_that_was_killed_after_its_last_epoch_is_completed(train: Train, finished: Path, tmp_path: Path) -> None:
+    before, mesh = results(finished), (finished / "refined.ply").read_bytes()
+    for name in ("refined.ply", "metrics.json"):
+        shutil.move(finished / name, tmp_path / name)
+    try:
+        train("", f"resume={finished}")
+        assert (finished / "refined.ply").read_bytes() == mesh
+        after = results(finished)
+    finally:
+        for name in ("refined.ply", "metrics.json"):
+            shutil.move(tmp_path / name, finished / name)
+    for name in ("val/psnr_db", "val/loss"):
+        assert after["metrics"][name] == pytest.approx(before["metrics"][name])
+
+
+@pytest.mark.parametrize(
+    ("epochs", "levels", "says"),
+    [
+        (1, [{"faces": 10, "shrink": 1}] * 2, "1 epochs are too few for 2 levels"),
+        (3, [{"faces": 10}], "give faces and shrink"),
+        (3, [{"faces": 10, "shrink": 0}], "1 or more"),
+    ],
+)
+def test_impossible_levels_are_refused(epochs: int, levels: list[dict[str, int]], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        Levels(epochs, levels)
 
 
 def test_training_stops_when_the_loss_has_come_to_rest_and_says_so(train: Train) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
@@ -38,13 +40,15 @@ class RefinementResults(L.Callback):
         """Measure and show the mesh that is started from, before anything moves."""
         stage, data = cast(SsGan3dStage, pl_module), cast(Any, trainer).datamodule
         start = prepared(data.mesh, stage.device)
-        batches = self._batches(trainer, stage)
-        rows = [stage.measure(batch, start) for batch in batches]
+        rows, self.before = [], []
+        for batch in self._batches(trainer, stage):
+            rows.append(stage.measure(batch, start))
+            if len(self.before) < self.photographs:
+                self.before.append(_image(stage.observe(batch, start)))
         self.start = {f"start/{name}": float(np.mean([float(row[name]) for row in rows])) for name in rows[0]}
         if data.shape is not None:
             found = data.shape(data.mesh.vertices, data.mesh.faces)
             self.start |= {f"start/{name}": value for name, value in found.items()}
-        self.before = [_image(stage.observe(batch, start)) for batch in batches[: self.photographs]]
         log.info("start: %s", _line(self.start, "start"))
         if not trainer.fast_dev_run and trainer.is_global_zero:  # type: ignore[attr-defined]
             write_mesh(_placed(data.mesh, data), self.folder / "start.ply")
@@ -56,10 +60,15 @@ class RefinementResults(L.Callback):
         if not trainer.sanity_checking and (trainer.current_epoch + 1) % self.every_n_epochs == 0:
             self._draw(trainer, pl_module, trainer.current_epoch + 1)
 
-    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_fit_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Write the mesh; also where a run that is resumed had been killed between its last epoch and this."""
         stage = cast(SsGan3dStage, pl_module)
-        if trainer.fast_dev_run or not trainer.is_global_zero:  # type: ignore[attr-defined]
+        if trainer.fast_dev_run or not trainer.is_global_zero or trainer.interrupted:  # type: ignore[attr-defined]
             return
+        if not self.start:
+            if (self.folder / "refined.ply").is_file():
+                return
+            self.on_train_start(trainer, pl_module)
         data = cast(Any, trainer).datamodule
         with torch.no_grad():
             vertices, colors = stage.mesh()
@@ -72,9 +81,9 @@ class RefinementResults(L.Callback):
         log.info("refined: %s", _line(values, "val"))
         log.info("Stopped by %s; the mesh is %s", stage.stopped_by, self.folder / "refined.ply")
 
-    def _batches(self, trainer: L.Trainer, stage: SsGan3dStage) -> list[dict[str, torch.Tensor]]:
-        loader = cast(Any, trainer).datamodule.val_dataloader()
-        return [{name: value.to(stage.device) for name, value in batch.items()} for batch in loader]
+    def _batches(self, trainer: L.Trainer, stage: SsGan3dStage) -> Iterator[dict[str, torch.Tensor]]:
+        for batch in cast(Any, trainer).datamodule.val_dataloader():
+            yield {name: value.to(stage.device) for name, value in batch.items()}
 
     def _draw(self, trainer: L.Trainer, pl_module: L.LightningModule, epochs: int) -> None:
         stage, shots = cast(SsGan3dStage, pl_module), cast(Any, trainer).datamodule.photographs
@@ -82,7 +91,7 @@ class RefinementResults(L.Callback):
             return
         folder = self.folder / "pictures"
         folder.mkdir(parents=True, exist_ok=True)
-        batches = self._batches(trainer, stage)[: self.photographs]
+        batches = islice(self._batches(trainer, stage), len(self.before))
         for i, (batch, before) in enumerate(zip(batches, self.before, strict=True)):
             index = int(batch["index"][0])
             kind = "not refined on" if shots.held_out[index] else "refined on"

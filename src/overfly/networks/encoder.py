@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -126,6 +126,12 @@ class Encoder(Part):
         with torch.no_grad():  # no correction is the best first guess
             last.weight.mul_(0.1)
             last.bias.zero_()
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Also from the names of runs that were made before the pyramid was a part of its own."""
+        for name in [name for name in state if name.startswith((f"{prefix}lateral.", f"{prefix}context."))]:
+            state[f"{prefix}pyramid.{name.removeprefix(prefix)}"] = state.pop(name)
+        super()._load_from_state_dict(state, prefix, *rest)
 
     def forward(self, images: Tensor) -> Encoded:
         """Encode M images [M, 3, H, W] in 0..1."""

@@ -15,8 +15,9 @@ from torch.utils.data import DataLoader
 
 from overfly.cloud import Cloud, read_cloud
 from overfly.data.dataset import WindowSampler
-from overfly.data.photographs import PhotographPairs, Photographs, photographs
+from overfly.data.photographs import PhotographPairs, Photographs, held_out, photographs
 from overfly.errors import InputError
+from overfly.files import existing
 from overfly.flights import Flight
 from overfly.mapping.block import Block
 from overfly.mapping.facts import ground_sampling
@@ -30,6 +31,9 @@ from overfly.refinement.measure import ShapeMeasure
 from overfly.rendering.topology import topology
 
 log = logging.getLogger("overfly")
+
+LEAST_WIDTH = 64
+"""Of the photographs, pixels."""
 
 MULTIPLE = 16
 """Width and height of the photographs are multiples of it: they are halved up to four times."""
@@ -81,6 +85,11 @@ class PhotographModule(L.LightningDataModule):
         cache_dir: str,
     ) -> None:
         super().__init__()
+        held_out(3, hold_out)  # refused now and not after minutes
+        if width is not None and width < LEAST_WIDTH:
+            raise InputError(f"width={width} shows no detail: give {LEAST_WIDTH} pixels or more, such as 512.")
+        if reference is not None:
+            existing(reference, "The reference cloud", (".ply", ".las", ".laz"))
         self.flight, self.synthetic, self.given, self.faces = flight, dict(synthetic), mesh, faces
         self.dense, self.cameras, self.reference = dense, cameras, reference
         self.width, self.hold_out, self.batch_size, self.seed = width, hold_out, batch_size, seed
@@ -102,6 +111,7 @@ class PhotographModule(L.LightningDataModule):
         self.photographs = photographs(
             block.frames, width=self.width, hold_out=self.hold_out, multiple=MULTIPLE, origin=origin
         )
+        mesh = welded(mesh)
         local = Mesh(mesh.vertices - origin, with_area(mesh.faces), mesh.colors)
         check_overlap(local, self.photographs)
         if local.colors is None:
@@ -111,6 +121,9 @@ class PhotographModule(L.LightningDataModule):
         self.mesh = local
         self.gsd = ground_sampling(Cloud(mesh.vertices), self.photographs.cameras, block.poses)
         truth = self.reference or flight.reference
+        if truth is not None and self.reference is None and (block.cameras_from == "estimated" or not block.metric):
+            log.info("%s is not used: it is in the frame of given cameras, and these are estimated", truth)
+            truth = None
         self.shape = None
         if truth is not None:
             cloud = read_cloud(truth)
@@ -156,6 +169,16 @@ class PhotographModule(L.LightningDataModule):
         folder = self.cache_dir / "photographs" / key_of(self.synthetic)
         fly(**self.synthetic, out=folder)
         return folder
+
+
+def welded(mesh: Mesh) -> Mesh:
+    """The mesh with vertices at the same place made one, or it would tear where a file keeps them apart."""
+    vertices, first, place = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    if len(vertices) == len(mesh.vertices):
+        return mesh
+    log.info("%d vertices at the place of another are joined", len(mesh.vertices) - len(vertices))
+    faces = place.reshape(-1)[mesh.faces].astype(np.int32)
+    return Mesh(vertices, faces, None if mesh.colors is None else mesh.colors[first])
 
 
 def with_area(faces: NDArray[np.int32]) -> NDArray[np.int32]:

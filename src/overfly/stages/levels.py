@@ -31,12 +31,23 @@ class Levels:
         levels: for each its ``faces`` and ``shrink``.
 
     Raises:
-        InputError: there is no level.
+        InputError: there is no level, fewer epochs than levels, or a level without its two positive numbers.
     """
 
     def __init__(self, epochs: int, levels: Sequence[Mapping[str, int]]) -> None:
         if not levels:
             raise InputError("stage.levels is empty: give at least one, for instance [{faces: 20000, shrink: 1}].")
+        for level in levels:
+            if set(level) != {"faces", "shrink"} or min(level.values()) < 1:
+                raise InputError(
+                    f"The level {dict(level)} is none: give faces and shrink, 1 or more each, "
+                    "such as {faces: 20000, shrink: 2}."
+                )
+        if 0 < epochs < len(levels):
+            raise InputError(
+                f"{epochs} epochs are too few for {len(levels)} levels: set trainer.max_epochs={len(levels)} or more, "
+                "or give fewer stage.levels."
+            )
         self.epochs = epochs
         self.levels = [Level(int(level["faces"]), int(level["shrink"])) for level in levels]
 

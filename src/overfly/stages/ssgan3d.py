@@ -20,7 +20,7 @@ from overfly.rendering.reproject import reproject
 from overfly.stages.exposures import Exposures
 from overfly.stages.levels import PATIENCE, Levels, converged
 from overfly.stages.refined_mesh import Mesh, Prepared, RefinedMesh, prepared
-from overfly.stages.shots import Shot, patches, shot_of
+from overfly.stages.shots import COVERED, Shot, patches, shot_of
 from overfly.stages.stage import Batch, OptimizerFactory, step_random
 
 log = logging.getLogger("overfly")
@@ -81,6 +81,9 @@ class SsGan3dStage(L.LightningModule):
         InputError: a weight is unknown, nothing would be compared, or there is no level.
     """
 
+    delivers_last = True
+    """Its result is the mesh of the last epoch, not of the best one."""
+
     def __init__(
         self,
         *,
@@ -123,6 +126,8 @@ class SsGan3dStage(L.LightningModule):
 
     def configure_model(self) -> None:
         """Start from the data module's mesh."""
+        if self.trainer.world_size > 1:
+            raise InputError("A refinement is of one mesh and runs in one process: leave trainer=ddp out.")
         if not hasattr(self, "mesh"):
             data = cast(Shots, self.trainer.datamodule)  # type: ignore[attr-defined]
             self.gsd = float(data.gsd)
@@ -161,13 +166,14 @@ class SsGan3dStage(L.LightningModule):
         return (found[0], found[1]) if isinstance(found, list) else (found, None)
 
     def on_train_epoch_start(self) -> None:
-        if self.levels.due(self.current_epoch) > self.level:
-            self.level, self.overall = self.levels.due(self.current_epoch), {}
-        if self.mesh.subdivide_to(self.levels[self.level].faces, least=self.gsd):
-            optimizer = self._optimizers()[0].optimizer
-            optimizer.state.clear()
-            optimizer.param_groups[0]["params"] = list(self.mesh.parameters())
-            log.info("level %d: %d faces", self.level + 1, len(self.mesh.faces))
+        due = self.levels.due(self.current_epoch)
+        if due > self.level or self.current_epoch == 0:
+            self.level, self.overall = due, {}
+            if self.mesh.subdivide_to(self.levels[due].faces, least=self.gsd):
+                optimizer = self._optimizers()[0].optimizer
+                optimizer.state.clear()
+                optimizer.param_groups[0]["params"] = list(self.mesh.parameters())
+                log.info("level %d: %d faces", due + 1, len(self.mesh.faces))
         self.mesh.forget_errors()
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:
@@ -229,8 +235,10 @@ class SsGan3dStage(L.LightningModule):
     def _consistency(self, present: Prepared, rendered: Rendered, shot: Shot, near: Shot, mask: Tensor) -> Tensor:
         with torch.no_grad():
             depth = present.seen_by(near.views).depth
-        carried, known = reproject(near.image, near.views, depth, rendered, shot.views)
-        seen = mask * known
+        photograph = torch.cat([near.image, near.valid[:, None].to(near.image)], 1)
+        carried, known = reproject(photograph, near.views, depth, rendered, shot.views)
+        carried, valid = carried[:, :3], carried[:, 3].detach() > COVERED
+        seen = mask * (known & valid)
         if self.exposure:
             carried = carried * image_losses.gains(carried, shot.image, seen).detach()[:, :, None, None]
         return (1 - image_losses.ssim(carried, shot.image, mask=seen)).mean()
