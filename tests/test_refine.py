@@ -184,6 +184,7 @@ def test_one_photograph_is_refused(run: Refine, tmp_path: Path, capfd: pytest.Ca
 
 
 def test_the_command_passes_everything_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
     from typer.testing import CliRunner
 
     from overfly.cli import app
