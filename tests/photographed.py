@@ -6,11 +6,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 
 from overfly.cloud import Cloud, write_cloud
 from overfly.flights import Frame, write_flight
 from overfly.geometry import Array, Camera, on_plane, pixel_grid, pose, rays, rotation_from_gimbal
 from overfly.mesh import Mesh, write_mesh
+
+KNOWN_WARNINGS = [
+    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
+    pytest.mark.filterwarnings("ignore:.*module.s. in eval mode at the start of training"),
+    pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists and is not empty"),
+]
+"""Of Lightning, in a training through the real command."""
 
 CAMERA = Camera(96, 64, 96.0, 96.0, 48.0, 32.0)
 ALTITUDE = 40.0

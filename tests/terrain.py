@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -103,27 +105,34 @@ def make_network(**changes):
         return GanDecoder(**{"size": [64, 32], "points": 256, "features": 32, **parts, **changes})
 
 
+SWEEP_SIZES = {
+    "size": [64, 32],
+    "points": 256,
+    "features": 32,
+    "encoder": {"widths": [8, 8, 8, 16], "descriptor": 16, "match_channels": 8, "correction_width": 16},
+    "generator": {
+        "hypotheses": 12,
+        "groups": 2,
+        "coarse_widths": [16, 16],
+        "fine_hypotheses": 5,
+        "fine_step": 0.5,
+        "fine_width": 16,
+    },
+    "discriminator": {"widths": [8, 16], "strides": [1, 4], "head_width": 8},
+}
+"""Of a tiny SweepDecoder for images of 64 x 32 pixels."""
+
+
 def make_sweep_network(**changes):
-    """A tiny SweepDecoder for images of 64 x 32 pixels, with the same random weights every time."""
+    """A tiny SweepDecoder, with the same random weights every time; ``changes`` of :data:`SWEEP_SIZES`."""
     from overfly.networks import SweepDecoder
 
-    parts = {
-        "encoder": {"widths": [8, 8, 8, 16], "descriptor": 16, "match_channels": 8, "correction_width": 16},
-        "generator": {
-            "hypotheses": 12,
-            "groups": 2,
-            "coarse_widths": [16, 16],
-            "fine_hypotheses": 5,
-            "fine_step": 0.5,
-            "fine_width": 16,
-        },
-        "discriminator": {"widths": [8, 16], "strides": [1, 4], "head_width": 8},
-    }
-    for name in parts:
-        parts[name] |= changes.pop(name, {})
+    sizes = deepcopy(SWEEP_SIZES)
+    for name in ("encoder", "generator", "discriminator"):
+        sizes[name] |= changes.pop(name, {})
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        return SweepDecoder(**{"size": [64, 32], "points": 256, "features": 32, **parts, **changes})
+        return SweepDecoder(**{**sizes, **changes})
 
 
 def make_local_network(**changes):

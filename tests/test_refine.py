@@ -21,15 +21,9 @@ from overfly.refinement.colors import colors_from
 from overfly.refinement.measure import ShapeMeasure
 from overfly.refinement.module import welded, with_area
 from overfly.rendering import topology
-from photographed import SHIFT, Photographed, color, flat_mesh, height, make_photographed, moved
+from photographed import KNOWN_WARNINGS, SHIFT, Photographed, color, flat_mesh, height, make_photographed, moved
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:FutureWarning"),
-    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:DeprecationWarning"),
-    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
-    pytest.mark.filterwarnings("ignore:.*module.s. in eval mode at the start of training"),
-    pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists and is not empty"),
-]
+pytestmark = KNOWN_WARNINGS
 
 QUICK = ["trainer.max_epochs=3", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "loss.adversarial=0"]
 

@@ -11,24 +11,9 @@ from omegaconf import OmegaConf
 
 from overfly.errors import InputError
 from overfly.shipped import DEFAULT, WEIGHTS, export, load_network, names
-from terrain import make_batch, make_sweep_network
+from terrain import SWEEP_SIZES, make_batch, make_sweep_network
 
-TINY = {
-    "_target_": "overfly.networks.SweepDecoder",
-    "size": [64, 32],
-    "points": 256,
-    "features": 32,
-    "encoder": {"widths": [8, 8, 8, 16], "descriptor": 16, "match_channels": 8, "correction_width": 16},
-    "generator": {
-        "hypotheses": 12,
-        "groups": 2,
-        "coarse_widths": [16, 16],
-        "fine_hypotheses": 5,
-        "fine_step": 0.5,
-        "fine_width": 16,
-    },
-    "discriminator": {"widths": [8, 16], "strides": [1, 4], "head_width": 8},
-}
+TINY = {"_target_": "overfly.networks.SweepDecoder", **SWEEP_SIZES}
 
 
 @pytest.fixture

@@ -26,15 +26,9 @@ from overfly.stages.levels import PATIENCE, Levels, converged
 from overfly.stages.refined_mesh import RefinedMesh, prepared
 from overfly.stages.shots import Shot, patches, shot_of
 from overfly.tables import read_rows
-from photographed import SHIFT, Photographed, flat_mesh, height, make_photographed
+from photographed import KNOWN_WARNINGS, SHIFT, Photographed, flat_mesh, height, make_photographed
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:FutureWarning"),
-    pytest.mark.filterwarnings("ignore:.*isinstance.treespec, LeafSpec:DeprecationWarning"),
-    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
-    pytest.mark.filterwarnings("ignore:.*module.s. in eval mode at the start of training"),
-    pytest.mark.filterwarnings("ignore:Checkpoint directory .* exists and is not empty"),
-]
+pytestmark = KNOWN_WARNINGS
 
 LEVELS = "stage.levels=[{faces:700,shrink:2},{faces:1300,shrink:1},{faces:2600,shrink:1}]"
 TWO_LEVELS = "stage.levels=[{faces:700,shrink:2},{faces:700,shrink:1}]"

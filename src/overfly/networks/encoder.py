@@ -165,8 +165,8 @@ class Encoder(Part):
         """The outputs of the first residual blocks."""
         x = self.stem((images.contiguous(memory_format=torch.channels_last) - 0.5) * 4)  # about unit variance
         maps: list[Tensor] = []
-        for down, block in zip([nn.Identity(), *self.downsampling][:blocks], self.blocks, strict=False):
-            x = block(down(x))
+        for i in range(blocks):
+            x = self.blocks[i](self.downsampling[i - 1](x) if i else x)
             maps.append(x)
         return maps
 

@@ -1,6 +1,6 @@
 """The three steps of rendering as operations of torch: rasterise, interpolate, antialias.
 
-Positions are float64 throughout and images float32; the kernels stand in :mod:`overfly.rendering.kernels`. Whatever
+Positions are float64 throughout and images float32; the kernels stand in modules of their own. Whatever
 renders a mesh with these three signatures can take their place.
 """
 
@@ -128,7 +128,7 @@ class _Antialias(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, screen: Tensor, topology: Topology, face: Tensor, depth: Tensor) -> Tensor:
         start()
-        from overfly.rendering.kernels import find_steps, soften
+        from overfly.rendering.silhouette_kernels import find_steps, soften
 
         values, screen = values.contiguous(), screen.contiguous()
         steps = torch.empty(*face.shape, 2, dtype=torch.int32, device=face.device)
@@ -143,7 +143,7 @@ class _Antialias(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        from overfly.rendering.kernels import soften_backward
+        from overfly.rendering.silhouette_kernels import soften_backward
 
         values, screen, faces, steps = ctx.saved_tensors
         of_softened, to_screen = gradients[0].contiguous(), torch.zeros_like(screen)
