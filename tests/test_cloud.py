@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_array_equal
 
-from overfly.cloud import Cloud, concatenate, read_cloud, voxel_thin, write_cloud
+from overfly.cloud import Cloud, concatenate, read_cloud, voxel_thin, write_cloud, write_clouds
 from overfly.errors import InputError
 
 UTM = np.array([569_123.4567, 5_187_432.1234, 183.4321])
@@ -48,6 +48,17 @@ def test_round_trip_keeps_everything(cloud: Cloud, tmp_path: Path, suffix: str, 
     write_cloud(cloud, path)
     same(cloud, read_cloud(path), atol)
     assert [p.name for p in path.parent.iterdir()] == [path.name], "a temporary file was left behind"
+
+
+@pytest.mark.parametrize("suffix", ["ply", "laz"])
+def test_parts_make_the_same_file_as_the_whole(
+    cloud: Cloud, tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_cloud(cloud, tmp_path / f"whole.{suffix}")
+    monkeypatch.setattr("overfly.cloud.PIECE", 70)
+    parts = [cloud[:100], cloud[100:100], cloud[100:]]
+    write_clouds(iter(parts), tmp_path / f"parts.{suffix}", count=len(cloud), low=cloud.points.min(0))
+    same(read_cloud(tmp_path / f"whole.{suffix}"), read_cloud(tmp_path / f"parts.{suffix}"), 0)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "laz"])
@@ -178,11 +189,11 @@ def test_failed_write_keeps_the_old_file(cloud: Cloud, tmp_path: Path, monkeypat
     write_cloud(cloud, path)
     before = path.read_bytes()
 
-    def full(self: object, target: Path) -> None:
-        Path(target).write_bytes(b"half")
+    def full(self: laspy.LasWriter, points: object) -> None:
+        self.dest.write(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(laspy.LasData, "write", full)
+    monkeypatch.setattr(laspy.LasWriter, "write_points", full)
     with pytest.raises(OSError, match="No space"):
         write_cloud(cloud[:10], path)
     assert path.read_bytes() == before
@@ -192,6 +203,7 @@ def test_failed_write_keeps_the_old_file(cloud: Cloud, tmp_path: Path, monkeypat
 def test_voxel_thin_keeps_one_point_per_voxel() -> None:
     points = np.array([[0, 0, 0], [0.4, 0, 0], [1.1, 0, 0], [0, 1.2, 0], [0.1, 0.1, 0.1]])
     assert_array_equal(voxel_thin(points, 1.0), [0, 2, 3])
+    assert_array_equal(voxel_thin(points + [0.7, 0, 0], 1.0), [0, 1, 3])  # voxels stand still where points move
     far = np.vstack([points, [[1e9, 1e9, 1e9]]])
     assert_array_equal(voxel_thin(far, 0.1), [0, 1, 2, 3, 4, 5])
 

@@ -7,7 +7,9 @@ are properties of these names in PLY and extra dimensions in LAS.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +18,14 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.files import existing, replacing
-from overfly.ply import read_ply, write_ply
+from overfly.ply import read_ply, write_ply_tables
 
 SUFFIXES = (".ply", ".las", ".laz")
 EXTRAS: dict[str, str] = {"confidence": "f4", "sigma_m": "f4", "views": "u1", "predicted": "u1"}
 """The optional attributes that files keep, and their types there."""
+
+PIECE = 1_000_000
+"""Points that are encoded for a file at once."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +65,9 @@ class Cloud:
 
 
 def voxel_thin(points: NDArray, size_m: float) -> NDArray[np.int64]:
-    """Indices of one point (the first) per cubic voxel of ``size_m``; sorted."""
-    keys = np.floor((points - points.min(0)) / size_m).astype(np.int64)
+    """Indices of one point (the first) per cubic voxel of ``size_m``, counted from the frame's origin; sorted."""
+    keys = np.floor(points / size_m).astype(np.int64)
+    keys -= keys.min(0)
     spans = [int(span) + 1 for span in keys.max(0)]
     if spans[0] * spans[1] * spans[2] >= 2**63:  # an outlier far away: the flat key would overflow
         return np.sort(np.unique(keys, axis=0, return_index=True)[1])
@@ -102,16 +108,44 @@ def write_cloud(cloud: Cloud, path: Path | str) -> None:
     Raises:
         InputError: the suffix is unknown, the cloud is empty or holds NaN.
     """
+    low = cloud.points.min(0) if len(cloud) else np.zeros(3)
+    write_clouds([cloud], path, count=len(cloud), low=low)
+
+
+def write_clouds(clouds: Iterable[Cloud], path: Path | str, *, count: int, low: NDArray) -> None:
+    """Write the parts of one cloud into one file, as :func:`write_cloud` does; one part at a time is in memory.
+
+    Args:
+        clouds: parts with the same attributes and CRS.
+        path: .ply, .las or .laz.
+        count: points of all parts.
+        low: [3], the smallest coordinates of all parts.
+
+    Raises:
+        InputError: the suffix is unknown, there is no point, or a coordinate is NaN.
+    """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"A cloud cannot be written as {path.name}: end the name in {', '.join(SUFFIXES)}.")
-    if not len(cloud) or not np.isfinite(cloud.points).all():
-        what = "has NaN or infinite coordinates" if len(cloud) else "has no points"
-        raise InputError(f"The cloud for {path} {what}, so it was not written.")
-    if path.suffix.lower() == ".ply":
-        _write_ply(cloud, path)
-    else:
-        _write_las(cloud, path)
+    if not count:
+        raise InputError(f"The cloud for {path} has no points, so it was not written.")
+    if not np.isfinite(low).all():
+        raise InputError(_NAN.format(path))
+    write = _write_ply if path.suffix.lower() == ".ply" else _write_las
+    write(_checked(clouds, path), path, count, low)
+
+
+_NAN = "The cloud for {} has NaN or infinite coordinates, so it was not written."
+
+
+def _checked(clouds: Iterable[Cloud], path: Path) -> Iterator[Cloud]:
+    """The parts that hold points, in pieces that are encoded at once."""
+    for cloud in clouds:
+        for start in range(0, len(cloud), PIECE):
+            piece = cloud[start : start + PIECE]
+            if not np.isfinite(piece.points).all():
+                raise InputError(_NAN.format(path))
+            yield piece
 
 
 def _read_ply(path: Path) -> Cloud:
@@ -133,14 +167,20 @@ def _read_ply(path: Path) -> Cloud:
     )
 
 
-def _write_ply(cloud: Cloud, path: Path) -> None:
+def _write_ply(clouds: Iterator[Cloud], path: Path, count: int, low: NDArray) -> None:
+    first = next(clouds)
+    tables = (_columns(cloud) for cloud in chain([first], clouds))
+    write_ply_tables(path, tables, count, comments=(f"epsg {first.epsg}",) if first.epsg else ())
+
+
+def _columns(cloud: Cloud) -> dict[str, NDArray]:
     columns = dict(zip("xyz", np.asarray(cloud.points, np.float64).T, strict=True))
     if cloud.colors is not None:
         columns |= dict(zip(("red", "green", "blue"), np.asarray(cloud.colors, np.uint8).T, strict=True))
     for name, kind in EXTRAS.items():
         if (values := getattr(cloud, name)) is not None:
             columns[name] = np.asarray(values).astype(kind)
-    write_ply(path, columns, comments=(f"epsg {cloud.epsg}",) if cloud.epsg else ())
+    return columns
 
 
 def _read_las(path: Path) -> Cloud:
@@ -192,26 +232,28 @@ def _epsg(header: Any, path: Path) -> int | None:
     return horizontal.to_epsg()
 
 
-def _write_las(cloud: Cloud, path: Path) -> None:
+def _write_las(clouds: Iterator[Cloud], path: Path, count: int, low: NDArray) -> None:
     import laspy
     from pyproj import CRS
 
-    header = laspy.LasHeader(point_format=6 if cloud.colors is None else 7, version="1.4")
+    first = next(clouds)
+    header = laspy.LasHeader(point_format=6 if first.colors is None else 7, version="1.4")
     header.scales = np.full(3, 0.001)
-    header.offsets = np.floor(cloud.points.min(0))
+    header.offsets = np.floor(low)
     header.generating_software = "Overfly"
-    if cloud.epsg:
-        header.add_crs(CRS.from_epsg(cloud.epsg))
-    kept = [name for name in EXTRAS if getattr(cloud, name) is not None]
+    if first.epsg:
+        header.add_crs(CRS.from_epsg(first.epsg))
+    kept = [name for name in EXTRAS if getattr(first, name) is not None]
     header.add_extra_dims([laspy.ExtraBytesParams(name, EXTRAS[name]) for name in kept])
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = np.asarray(cloud.points, np.float64).T
-    if cloud.colors is not None:
-        las.red, las.green, las.blue = np.asarray(cloud.colors, np.uint16).T * 257
-    for name in kept:
-        las[name] = np.asarray(getattr(cloud, name)).astype(EXTRAS[name])
-    with replacing(path) as temporary:
-        las.write(temporary)
+    with replacing(path) as temporary, laspy.open(temporary, mode="w", header=header) as las:
+        for cloud in chain([first], clouds):
+            record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
+            record.x, record.y, record.z = np.asarray(cloud.points, np.float64).T
+            if cloud.colors is not None:
+                record.red, record.green, record.blue = np.asarray(cloud.colors, np.uint16).T * 257
+            for name in kept:
+                record[name] = np.asarray(getattr(cloud, name)).astype(EXTRAS[name])
+            las.write_points(record)
 
 
 def _as_uint8(values: NDArray) -> NDArray[np.uint8]:

@@ -13,6 +13,13 @@ class InputError(Exception):
     """
 
 
+class Damaged(InputError):
+    """A file that was kept for later is cut off or changed: whoever can make it again drops it and does."""
+
+    def __init__(self, path: object) -> None:
+        super().__init__(f"{path} is damaged: give the same command again, and it is made anew.")
+
+
 def unknown(what: str, given: object, allowed: Iterable[object], fix: str = "") -> InputError:
     """An :class:`InputError` for a name that does not exist, with the nearest one that does."""
     names = sorted(str(name) for name in allowed)

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
 
-from overfly.errors import InputError
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.errors import Damaged, InputError
+
+UNREADABLE = (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error)
+"""What NumPy raises for an .npy or .npz file that is missing, cut off or changed."""
 
 
 @contextmanager
@@ -47,3 +55,27 @@ def existing(path: Path | str, what: str, suffixes: tuple[str, ...]) -> Path:
     if not path.is_file():
         raise InputError(f"{what} {path} is not a file: give a file that ends in {', '.join(suffixes)}.")
     return path
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write arrays as .npz, uncompressed: complete or absent."""
+    part = path.with_name(f"{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            np.savez(file, **dict(arrays))  # type: ignore[arg-type]
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def load_arrays(path: Path) -> dict[str, NDArray]:
+    """All arrays of an .npz file; the checksums that it holds are compared.
+
+    Raises:
+        Damaged: it is missing, cut off or changed.
+    """
+    try:
+        with np.load(path) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except UNREADABLE as error:
+        raise Damaged(path) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -72,19 +73,32 @@ def write_ply(
     comments: tuple[str, ...] = (),
 ) -> None:
     """Write a binary little-endian PLY file, atomically; a column keeps its type."""
-    table = np.empty(
-        len(next(iter(columns.values()))), [(name, "<" + column.dtype.str[1:]) for name, column in columns.items()]
-    )
-    for name, column in columns.items():
-        table[name] = column
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
-    header += [f"element vertex {len(table)}"]
-    header += [f"property {NAMES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
-    if faces is not None:
-        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    count = len(next(iter(columns.values())))
+    write_ply_tables(path, [columns], count, faces, comments)
+
+
+def write_ply_tables(
+    path: Path | str,
+    tables: Iterable[dict[str, NDArray]],
+    count: int,
+    faces: NDArray | None = None,
+    comments: tuple[str, ...] = (),
+) -> None:
+    """As :func:`write_ply`, of vertices that come in several tables of the same columns, ``count`` in all."""
     with replacing(path) as temporary, temporary.open("wb") as file:
-        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
-        file.write(table.tobytes())
+        for number, columns in enumerate(tables):
+            kinds = [(name, "<" + column.dtype.str[1:]) for name, column in columns.items()]
+            if number == 0:
+                header = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
+                header += [f"element vertex {count}"]
+                header += [f"property {NAMES[kind[1:]]} {name}" for name, kind in kinds]
+                if faces is not None:
+                    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+                file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+            table = np.empty(len(next(iter(columns.values()))), kinds)
+            for name, column in columns.items():
+                table[name] = column
+            file.write(table.tobytes())
         if faces is not None:
             corners = np.empty(len(faces), [("n", "u1"), ("v", "<i4", 3)])
             corners["n"], corners["v"] = 3, faces
