@@ -22,6 +22,7 @@ from overfly.geodesy import Origin, crs_from_enu
 from overfly.geometry import OPENCV_FROM_OPENGL, Camera, on_plane, pixel_grid, pose, rotation_from_gimbal, transform
 from overfly.mapping.map import map_flight
 from overfly.mapping.settings import MapSettings
+from overfly.mapping.tiles import write_tiles
 
 CAMERA = Camera(96, 72, 80.0, 80.0, 49.0, 35.0)
 ORIGIN = {"latitude": 46.84, "longitude": -91.99, "height": 150.0}
@@ -312,12 +313,14 @@ def test_a_frame_whose_z_is_not_up_gets_no_rasters_and_keeps_its_cloud(tmp_path:
     steps = Steps(tmp_path / "work", resume=True, show=False)
     out = tmp_path / "out"
     out.mkdir()
-    summary = deliver(lying, given_block(lying), cloud, out, MapSettings(dense="stereo"), steps)
+    tiles = write_tiles(tmp_path / "tiles", [cloud[:1000], cloud[1000:]])
+    summary = deliver(lying, given_block(lying), tiles, out, MapSettings(dense="stereo"), steps)
     assert not (out / "dsm.tif").exists()
     assert "does not point up" in summary["warnings"][0]
     np.testing.assert_allclose(read_cloud(out / "cloud.laz").points, cloud.points, atol=1e-3)
     assert summary["gsd_m"] == pytest.approx(55 / 80, rel=0.02)
-    deliver(lying, upright_block, Cloud(ground), out, MapSettings(dense="stereo"), steps)
+    flat = write_tiles(tmp_path / "flat", [Cloud(ground)])
+    deliver(lying, upright_block, flat, out, MapSettings(dense="stereo"), steps)
     assert (out / "dsm.tif").exists()
 
 

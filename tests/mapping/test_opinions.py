@@ -120,8 +120,9 @@ def test_where_nothing_matches_the_networks_word_stands_and_is_marked(hill, stri
 
         return answer
 
-    measured = fuse(stereo(frames, workdir=tmp_path / "stereo"), frames)
-    cloud = fuse(stereo(frames, workdir=tmp_path / "sweep", opinions=truthful), frames)
+    stereo_folder, sweep_folder = tmp_path / "stereo", tmp_path / "sweep"
+    measured = fuse(stereo(frames, workdir=stereo_folder), frames, workdir=stereo_folder).whole()
+    cloud = fuse(stereo(frames, workdir=sweep_folder, opinions=truthful), frames, workdir=sweep_folder).whole()
     assert not measured.predicted.any()
     assert 0.2 < cloud.predicted.mean() < 0.6  # what one frame alone sees
     assert (~cloud.predicted).sum() >= 0.98 * len(measured)

@@ -11,6 +11,91 @@ from overfly.cloud import Cloud
 from overfly.errors import InputError
 from overfly.mapping.products import NODATA, cell_size, raster_products
 from overfly.mapping.raster import Grid, grid_over, surface
+from overfly.mapping.tiles import Tiles, write_tiles
+
+
+def tiled(cloud: Cloud, folder: Path, side: float = 1e9) -> Tiles:
+    """A cloud in a folder, cut into squares of the plan."""
+    owner = np.unique(np.floor(cloud.points[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
+    return write_tiles(folder, [cloud[owner == k] for k in range(owner.max() + 1 if len(owner) else 0)])
+
+
+def rough_ground(n: int = 30_000) -> Cloud:
+    """40 x 25 m of thin, noisy, coloured points with houses, a hole and single strays: all that filters work on."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform([100, -50, 0], [140, -25, 0.3], (n, 3))
+    points[(np.floor(points[:, :2] / 7).sum(1) % 3) == 0, 2] += 6
+    points = points[np.hypot(*(points[:, :2] - [117, -38]).T) > 3]
+    points[::500, 2] += rng.uniform(-20, 20, len(points[::500]))
+    return Cloud(points, rng.integers(0, 255, (len(points), 3), dtype=np.uint8))
+
+
+def bands(folder: Path) -> dict[str, np.ndarray]:
+    import rasterio
+
+    found = {}
+    for name in ("dsm", "orthophoto"):
+        with rasterio.open(folder / f"{name}.tif") as file:
+            found[name] = file.read()
+    return found
+
+
+@pytest.mark.parametrize(("side", "window"), [(9.0, 64), (4.0, 33), (1e9, 50)])
+def test_no_seam_of_tiles_or_windows_shows(tmp_path: Path, side: float, window: int) -> None:
+    cloud = rough_ground()
+    one, many = tmp_path / "one", tmp_path / "many"
+    raster_products(tiled(cloud, one / "tiles"), one, gsd=0.1)
+    raster_products(tiled(cloud, many / "tiles", side), many, gsd=0.1, window=window)
+    whole, cut = bands(one), bands(many)
+    assert (whole["dsm"] == NODATA).any()
+    np.testing.assert_allclose(cut["dsm"], whole["dsm"], atol=1e-5)
+    np.testing.assert_array_equal(cut["orthophoto"], whole["orthophoto"])
+
+
+class Checks:
+    """Paints what it is given: heights under the cell, and how far the surface reaches around the window."""
+
+    reach = 3.0
+
+    def __init__(self, overview: Grid, heights: np.ndarray) -> None:
+        self.overview, self.heights, self.windows = overview, heights, 0
+
+    def window(self, grid: Grid, around: Grid, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        self.windows += 1
+        at = around.cells(grid.centres().reshape(-1, 2))
+        z = np.where(at >= 0, heights.ravel()[np.maximum(at, 0)], np.nan).reshape(grid.rows, grid.columns)
+        filled = np.isfinite(z)
+        colors = np.repeat(np.where(filled, 100 + 10 * np.nan_to_num(z), 0)[..., None], 3, -1)
+        return np.clip(colors, 0, 255).astype(np.uint8), (filled * 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_a_painter_colours_the_windows_from_the_surface_around_them(tmp_path: Path, factor: float) -> None:
+    made: list[Checks] = []
+
+    def make(overview: Grid, heights: np.ndarray) -> Checks:
+        made.append(Checks(overview, heights))
+        return made[-1]
+
+    cloud = rough_ground()
+    gsd = 0.1
+    cell = cell_size([cloud], gsd) * factor
+    grid = raster_products(
+        tiled(cloud, tmp_path / "tiles"), tmp_path, gsd=gsd, painter=make, photo_cell=cell, window=50
+    )
+    found = bands(tmp_path)
+    assert made[0].windows > 4
+    extent = made[0].overview.extent
+    assert extent[0] == grid.extent[0]
+    assert extent[1] >= grid.extent[1]
+    assert -1 < np.nanmedian(made[0].heights) < 7
+    times = round(1 / factor)
+    heights = found["dsm"][0].repeat(times, 0).repeat(times, 1)
+    photo = found["orthophoto"]
+    assert photo.shape[1:] == heights.shape
+    np.testing.assert_array_equal(photo[3] > 0, heights != NODATA)
+    known = (heights != NODATA) & (np.abs(heights) < 9)
+    np.testing.assert_allclose(photo[0][known], 100 + 10 * heights[known], atol=1)
 
 
 def test_cells_by_hand() -> None:
@@ -66,13 +151,13 @@ def test_files_read_back(tmp_path: Path, epsg: int | None) -> None:
     points = points[~((np.abs(points[:, 0] - 600_010) < 4) & (np.abs(points[:, 1] - 5_000_010) < 4))]
     colors = np.full((len(points), 3), (200, 100, 50), np.uint8)
     cloud = Cloud(points, colors, epsg=epsg)
-    raster_products(cloud, tmp_path, gsd=0.1)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["dsm.tif", "orthophoto.tif"]
+    raster_products(tiled(cloud, tmp_path / "tiles"), tmp_path, gsd=0.1)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dsm.tif", "orthophoto.tif", "tiles"]
     with rasterio.open(tmp_path / "dsm.tif") as dsm:
         assert (dsm.crs.to_epsg() if dsm.crs else None) == epsg
         assert dsm.nodata == NODATA
         assert dsm.profile["tiled"]
-        assert dsm.res[0] == pytest.approx(max(0.2, cell_size(cloud, 0.1)))
+        assert dsm.res[0] == pytest.approx(max(0.2, cell_size([cloud], 0.1)))
         values = [v[0] for v in dsm.sample([(600_035, 5_000_010), (600_020, 5_000_010), (600_010, 5_000_010)])]
         assert values == pytest.approx([12.0, 0.0, NODATA], abs=0.02)
     with rasterio.open(tmp_path / "orthophoto.tif") as photo:
@@ -83,15 +168,15 @@ def test_files_read_back(tmp_path: Path, epsg: int | None) -> None:
 
 def test_sparse_clouds_get_larger_cells() -> None:
     points = np.random.default_rng(0).uniform([0, 0, 0], [100, 100, 1], (1000, 3))
-    assert cell_size(Cloud(points), 5.0) == 10.0
-    assert 4 < cell_size(Cloud(points), 0.05) < 8  # three points on 30 square metres
-    assert 0.1 <= cell_size(Cloud(points[:1]), 0.05) < 1
+    assert cell_size([Cloud(points)], 5.0) == 10.0
+    assert 4 < cell_size([Cloud(points)], 0.05) < 8  # three points on 30 square metres
+    assert 0.1 <= cell_size([Cloud(points[:1])], 0.05) < 1
 
 
 def test_empty_or_absurd_clouds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no points"):
-        raster_products(Cloud(np.zeros((0, 3))), tmp_path, gsd=0.1)
+        raster_products(tiled(Cloud(np.zeros((0, 3))), tmp_path / "a"), tmp_path, gsd=0.1)
     points = np.random.default_rng(0).uniform(0, 1e7, (1000, 3))
     with pytest.raises(InputError, match="extent"):
-        raster_products(Cloud(points), tmp_path, gsd=0.01)
-    assert list(tmp_path.iterdir()) == []
+        raster_products(tiled(Cloud(points), tmp_path / "b"), tmp_path, gsd=0.01)
+    assert not list(tmp_path.glob("*.tif"))

@@ -28,7 +28,7 @@ def cloud(hill, strips, camera, tmp_path_factory):  # type: ignore[no-untyped-de
     seen: list[tuple[int, int]] = []
     maps = stereo(frames, workdir=folder / "work", progress=lambda done, total: seen.append((done, total)))
     assert seen[-1] == (6, 6)
-    return fuse(maps, frames)
+    return fuse(maps, frames, workdir=folder / "fused").whole()
 
 
 def test_the_cloud_lies_on_the_ground(cloud, hill) -> None:  # type: ignore[no-untyped-def]
@@ -161,5 +161,5 @@ def test_a_camera_of_another_size_is_scaled(hill, strips, tmp_path: Path) -> Non
     frames = hill.frames(tmp_path, camera, strips[:2], known=True)
     maps = stereo(frames, workdir=tmp_path / "work", max_size=200)
     assert (maps[0].camera.width, maps[0].camera.height) == (200, 150)
-    cloud = fuse(maps, frames, voxel_m=1.0)
+    cloud = fuse(maps, frames, workdir=tmp_path / "fused", voxel_m=1.0).whole()
     assert np.median(np.abs(hill.off(cloud.points))) < 0.4

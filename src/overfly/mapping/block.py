@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from overfly.cloud import Cloud
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array, Camera
+from overfly.mapping.survey import Precision, Survey, precision_from, survey_from
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +28,10 @@ class Block:
         metric: whether lengths are metres.
         reprojection_px: mean reprojection error, None if unknown.
         points: sparse surface points [M, 3] in the block's frame, or None.
+        survey: what ground control says, None where the flight has none or it was not asked.
+        precision: standard deviations of the cameras, None of given cameras.
+        links: (i, j, number of common points) of frames i < j.
+        held_by_gps: names of frames that only GPS connects to the others.
         warnings: sentences for the user.
     """
 
@@ -38,6 +41,10 @@ class Block:
     metric: bool
     reprojection_px: float | None = None
     points: Array | None = None
+    survey: Survey | None = None
+    precision: Precision | None = None
+    links: list[tuple[int, int, int]] = field(default_factory=list)
+    held_by_gps: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -65,12 +72,17 @@ class Block:
         return found
 
     def gps_rms(self) -> dict[str, float | None] | None:
-        """RMS distance of the cameras from their own GPS, a constant shift in height taken out; None without GPS."""
+        """RMS distance of the cameras from their own GPS; None without GPS.
+
+        A constant shift in height is taken out, and in the plane too where ground control tells it.
+        """
         told = self.gps_positions()
         if not told:
             return None
         positions = dict(zip(self.names, self.poses[:, :3, 3], strict=True))
         away = np.array([positions[name] - told[name] for name in told])
+        if self.survey is not None and self.survey.gps_shift_m is not None:
+            away[:, :2] += self.survey.gps_shift_m[:2]
         rises = away[np.isfinite(away[:, 2]), 2]
         vertical = float(np.sqrt(np.mean((rises - np.median(rises)) ** 2))) if len(rises) else None
         return {
@@ -119,6 +131,10 @@ def write_block(block: Block, folder: Path) -> None:
         "cameras_from": block.cameras_from,
         "metric": block.metric,
         "reprojection_px": block.reprojection_px,
+        "survey": None if block.survey is None else asdict(block.survey),
+        "precision": None if block.precision is None else block.precision.to_json(),
+        "links": block.links,
+        "held_by_gps": block.held_by_gps,
         "warnings": block.warnings,
     }
     (folder / "block.json").write_text(json.dumps(content))
@@ -147,20 +163,9 @@ def read_block(folder: Path, flight: Flight) -> Block:
         content["metric"],
         content["reprojection_px"],
         np.load(points) if points.is_file() else None,
+        survey_from(content["survey"]),
+        precision_from(content["precision"]),
+        [(i, j, count) for i, j, count in content["links"]],
+        content["held_by_gps"],
         content["warnings"],
     )
-
-
-ATTRIBUTES = ("points", "colors", "confidence", "sigma_m", "views", "predicted")
-
-
-def keep_cloud(cloud: Cloud, folder: Path) -> None:
-    """Keep a cloud in a folder, exactly."""
-    arrays: dict[str, NDArray] = {n: getattr(cloud, n) for n in ATTRIBUTES if getattr(cloud, n) is not None}
-    np.savez(folder / "cloud.npz", **arrays)  # type: ignore[arg-type]
-
-
-def kept_cloud(folder: Path) -> Cloud:
-    """The cloud that :func:`keep_cloud` kept."""
-    with np.load(folder / "cloud.npz") as arrays:
-        return Cloud(**{name: arrays[name] for name in arrays.files})

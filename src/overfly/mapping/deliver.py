@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from overfly import __version__
-from overfly.cloud import Cloud, write_cloud
+from overfly.cloud import Cloud, write_clouds
 from overfly.errors import InputError
 from overfly.files import replacing
 from overfly.flights import Flight, Frame, write_transforms
@@ -24,12 +25,17 @@ from overfly.mapping.raster import Surface
 from overfly.mapping.report import Caution, duration, write_report
 from overfly.mapping.settings import MapSettings
 from overfly.mapping.steps import Steps, peak_memory_mb
+from overfly.mapping.tiles import Tiles
 
 LEVEL = 0.5
 """Cosine of the largest angle between up, as the cameras tell it, and the frame's z axis."""
 
 
-def deliver(flight: Flight, block: Block, local: Cloud, out: Path, asked: MapSettings, steps: Steps) -> dict[str, Any]:
+SAMPLE = 2_000_000
+"""Points that tell figures and make pictures: all of a small flight."""
+
+
+def deliver(flight: Flight, block: Block, local: Tiles, out: Path, asked: MapSettings, steps: Steps) -> dict[str, Any]:
     """Write every product of a finished cloud into ``out`` and return the content of ``map.json``.
 
     Args:
@@ -45,15 +51,16 @@ def deliver(flight: Flight, block: Block, local: Cloud, out: Path, asked: MapSet
     """
     if len(local) == 0:
         raise InputError("No point could be measured: the images overlap too little or show too little texture.")
-    gsd = ground_sampling(local, block.cameras, block.poses)
-    placed = georeferenced(local, block)
+    few = local.sample(SAMPLE)
+    gsd = ground_sampling(few, block.cameras, block.poses)
+    placed, few_placed = local.moved(partial(georeferenced, block=block)), georeferenced(few, block)
     turn = upright(block.poses)
     level = bool(turn[2, 2] > LEVEL)
     turn = np.eye(4) if level else turn
     written = ["cloud.laz", *(["cloud.ply"] if asked.ply else [])]
     with steps.timed("products"):
         for name in written:
-            write_cloud(placed, out / name)
+            write_clouds(placed, out / name, count=len(placed), low=placed.bounds.min((0, 1)))
         facts = {} if block.metric else {"scale": "unknown"}
         write_transforms(out / "transforms.json", block.frames, block.origin, facts)
         for name in ("dsm.tif", "orthophoto.tif"):
@@ -65,16 +72,16 @@ def deliver(flight: Flight, block: Block, local: Cloud, out: Path, asked: MapSet
     steps.say("products", ", ".join(written[:-1]))
     with steps.timed("report"):
         shown, seen = gallery(
-            local.with_points(transform(turn, local.points)),
+            few.with_points(transform(turn, few.points)),
             block.cameras,
             turn @ block.poses,
             block.names,
             gsd=gsd,
             unit="m" if block.metric else "units",
-            height_offset=float(np.median(placed.points[:, 2] - local.points[:, 2])),
+            height_offset=float(np.median(few_placed.points[:, 2] - few.points[:, 2])),
             missing=list(block.gps_positions(lost_frames(flight, block)).items()),
         )
-    summary = summarise(flight, block, placed, seen, gsd, asked, steps)
+    summary = summarise(flight, block, cloud_facts(placed, few_placed, seen, gsd), few_placed.epsg, asked, steps)
     found = _cautions(flight, block, seen, summary, level)
     summary["warnings"] = [str(c).strip() for c in found]
     with steps.timed("report"):
@@ -109,18 +116,17 @@ def lost_frames(flight: Flight, block: Block) -> list[Frame]:
 
 
 def summarise(
-    flight: Flight, block: Block, placed: Cloud, seen: Surface, gsd: float, asked: MapSettings, steps: Steps
+    flight: Flight, block: Block, counted: dict[str, Any], epsg: int | None, asked: MapSettings, steps: Steps
 ) -> dict[str, Any]:
-    """The content of ``map.json``, its warnings still empty."""
-    counted = cloud_facts(placed, seen, gsd)
+    """The content of ``map.json``, its warnings still empty; ``counted`` is of the cloud, ``epsg`` its CRS."""
     return {
         "images": len(flight) + len(flight.skipped),
         "registered": len(block.frames),
         "points": counted["points"],
         "measured": counted["measured"],
         "predicted": counted["predicted"],
-        "gsd_m": round(gsd, 5) if block.metric else None,
-        "crs": None if placed.epsg is None else f"EPSG:{placed.epsg}",
+        "gsd_m": round(counted["gsd"], 5) if block.metric else None,
+        "crs": None if epsg is None else f"EPSG:{epsg}",
         "cameras_from": block.cameras_from,
         "seconds": steps.seconds,
         "peak_memory_mb": round(peak_memory_mb(), 1),

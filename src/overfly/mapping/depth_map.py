@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from overfly.errors import Damaged
+from overfly.files import UNREADABLE
 from overfly.geometry import Array, Camera, pixel_grid, rays
 from overfly.mapping.anchor import Map, anchored
 
@@ -72,7 +77,12 @@ class DepthMap:
     path: Path
 
     def load(self) -> dict[str, NDArray]:
-        with np.load(self.path) as data:
+        """What pairs have measured.
+
+        Raises:
+            Damaged: the file is missing, cut off or changed.
+        """
+        with self._opened() as data:
             return {
                 "depth": data["depth"],
                 "sigma": data["sigma"].astype(np.float32),
@@ -81,9 +91,17 @@ class DepthMap:
                 "paired": data["paired"],
             }
 
+    @contextmanager
+    def _opened(self) -> Iterator[Any]:
+        try:
+            with np.load(self.path) as data:
+                yield data
+        except UNREADABLE as error:
+            raise Damaged(self.path) from error
+
     def opinion(self) -> Opinion | None:
         """What the network said of the frame, None without one."""
-        with np.load(self.path) as data:
+        with self._opened() as data:
             if "opinion_depth" not in data:
                 return None
             return Opinion(*(data[f"opinion_{name}"] for name in ("depth", "sigma", "confidence", "views", "alone")))

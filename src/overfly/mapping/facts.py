@@ -12,32 +12,43 @@ from overfly.cloud import Cloud
 from overfly.data.footprints import sees
 from overfly.geometry import Array, Camera, project
 from overfly.mapping.raster import Surface
+from overfly.mapping.tiles import Tiles
+
+ASKED = 200
+"""Frames, spread over the flight, that tell the ground sampling distance."""
 
 
 def ground_sampling(cloud: Cloud, cameras: Sequence[Camera], poses: Array) -> float:
     """Median over the frames of depth / focal length: metres (or units) per pixel on what they see."""
-    sample = cloud.points[:: max(1, len(cloud) // 4000)]
+    sample = cloud.points[:: max(1, len(cloud) // max(4000, 20 * len(cameras)))]
+    step = -(-len(cameras) // ASKED)
     found = []
-    for camera, pose in zip(cameras, poses, strict=True):
+    for camera, pose in zip(cameras[::step], poses[::step], strict=True):
         inside = sample[sees(sample, camera, pose)]
         if len(inside):
             found.append(float(np.median(project(inside, camera, pose)[1])) / camera.fx)
     return float(np.median(found)) if found else float("nan")
 
 
-def cloud_facts(cloud: Cloud, seen: Surface, gsd: float) -> dict[str, Any]:
-    """Points, measured, predicted, area, density, height range, median sigma; lengths in the cloud's unit."""
-    predicted = 0 if cloud.predicted is None else int(cloud.predicted.sum())
+def cloud_facts(cloud: Tiles, sample: Cloud, seen: Surface, gsd: float) -> dict[str, Any]:
+    """Points, measured, predicted, area, density, height range, median sigma; lengths in the cloud's unit.
+
+    Args:
+        cloud: all points.
+        sample: many of them, in the CRS of the product.
+        seen: the surface that areas are counted on.
+        gsd: ground sampling distance.
+    """
     area = float(np.count_nonzero(seen.filled)) * seen.grid.cell**2
-    low, high = np.percentile(cloud.points[:, 2], [1, 99])
+    low, high = np.percentile(sample.points[:, 2], [1, 99])
     return {
         "points": len(cloud),
-        "measured": len(cloud) - predicted,
-        "predicted": predicted,
+        "measured": len(cloud) - cloud.predicted,
+        "predicted": cloud.predicted,
         "area": round(area, 4),
         "points_per_area": round(len(cloud) / area, 3) if area else 0.0,
         "height_range": [round(float(low), 3), round(float(high), 3)],
-        "median_sigma": None if cloud.sigma_m is None else round(float(np.median(cloud.sigma_m)), 4),
+        "median_sigma": None if sample.sigma_m is None else round(float(np.median(sample.sigma_m)), 4),
         "seen_once_share": _share_once(seen),
         "gsd": gsd,
     }

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from overfly import __version__
-from overfly.cloud import Cloud
 from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
-from overfly.mapping.block import Block, checked, given_block, keep_cloud, kept_cloud, read_block, write_block
+from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
 from overfly.mapping.needs import memory_gb
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import SIZE, MapSettings
-from overfly.mapping.steps import Steps, claim, fingerprint, key_of
+from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
+from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles, write_tiles
 
 FEWEST_POINTS = 30
 """Sparse points that tell the height of the ground."""
@@ -50,7 +50,7 @@ def align_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any)
         return flight, _aligned(flight, identity, asked, steps)[0]
 
 
-def measure_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> tuple[Flight, Block, Cloud]:
+def measure_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> tuple[Flight, Block, Tiles]:
     """The flight, its cameras and the dense cloud in their frame, without products; arguments as :func:`map_flight`."""
     flight, steps, identity, asked = _opened(flight_folder, out, settings)
     with _told_when_stopped(steps):
@@ -83,6 +83,13 @@ def _told_when_stopped(steps: Steps) -> Iterator[None]:
             "The same command goes on from there.",
         )
         raise
+    except OSError as error:
+        if (reason := unwritable(error, steps.folder)) is None:
+            raise
+        raise InputError(
+            f"{steps.folder.parent} cannot be written during {steps.running or 'the start'}: {reason}. What is "
+            "finished is kept, and the same command goes on from there."
+        ) from error
 
 
 def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, str]:
@@ -102,16 +109,16 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
     return block, key
 
 
-def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, Cloud]:
+def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, Tiles]:
     block, key = _aligned(flight, identity, asked, steps)
     check_memory(block, asked)
     network = _network_key(asked) if asked.dense == "sweep" else None
     key = key_of(key, asked.dense, network, asked.seed, *([] if asked.size == SIZE else [asked.size]))
-    make: Callable[[Path], Cloud] = {
+    make: Callable[[Path], Tiles] = {
         "sweep": lambda scratch: sweep_cloud(block, flight, scratch, asked, steps),
         "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
     }[asked.dense]
-    local = steps.kept("dense", key, make, keep_cloud, kept_cloud)
+    local = steps.kept("dense", key, make, keep_tiles, kept_tiles)
     steps.say("dense", f"{count_text(len(local))} points by {_how(asked)}")
     return block, local
 
@@ -140,12 +147,12 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
     )
 
 
-def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:
+def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Tiles:
     """The dense cloud by semi-global matching, in the block's frame."""
     return _fused(block, scratch, asked, steps, None)
 
 
-def sweep_cloud(block: Block, flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Cloud:
+def sweep_cloud(block: Block, flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Tiles:
     """The dense cloud by the trained network, in the block's frame."""
     run = asked.network
     assert run is not None
@@ -168,10 +175,11 @@ def sweep_cloud(block: Block, flight: Flight, scratch: Path, asked: MapSettings,
         priors.append(prior_pose(position, frame.gimbal, pose))
     ground = ground_height(block, flight, asked.seed)
     with steps.bar("dense", "windows") as update:
-        return network_cloud(block.frames, run, ground_height=ground, priors=priors, progress=update)
+        cloud = network_cloud(block.frames, run, ground_height=ground, priors=priors, progress=update)
+    return write_tiles(scratch / "tiles", [cloud])
 
 
-def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinions: Any) -> Cloud:
+def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinions: Any) -> Tiles:
     from overfly.mapping.fuse import fuse
     from overfly.mapping.stereo import stereo
 
@@ -185,8 +193,8 @@ def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinio
             opinions=opinions,
             progress=update,
         )
-    with steps.bar("dense", "fused") as update:
-        return fuse(maps, block.frames, progress=update)
+    with steps.bar("dense", "fused") as update, steps.bar("dense", "tiles") as update_tiles:
+        return fuse(maps, block.frames, workdir=scratch, progress=update, progress_of_tiles=update_tiles)
 
 
 def ground_height(block: Block, flight: Flight, seed: int) -> float:

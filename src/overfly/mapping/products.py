@@ -1,94 +1,294 @@
-"""The rasters made from a cloud: surface model (dsm.tif) and orthophoto (orthophoto.tif)."""
+"""The rasters made from a cloud: surface model (dsm.tif) and orthophoto (orthophoto.tif), window by window.
+
+A window is computed with as many cells around it as its filters look at, so that no border of a window shows. Windows
+go to a plain GeoTIFF beside the target, which becomes a cloud-optimised one at the end.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.cloud import Cloud
+from overfly.cloud import Cloud, concatenate
 from overfly.errors import InputError
 from overfly.files import replacing
-from overfly.mapping.raster import Grid, Surface, grid_over, surface
+from overfly.mapping.raster import Grid, grid_over, surface
+from overfly.mapping.tiles import Tiles
 
 NODATA = -9999.0
 MAX_CELLS = 200_000_000
+"""Cells above which a map must be filled by its points: stray points make a large map of nothing."""
+
+EMPTIEST = 50
+"""Cells per point in a map so large, at most; a filled cell has three points or so."""
+
+WINDOW = 1024
+"""Cells along a window."""
+
+SAMPLE = 2_000_000
+"""Points by which a map's extent is told."""
+
+DENSITY = 4_000_000
+"""Points by which the size of its cells is told."""
+
+GDAL_CACHE = 64 * 2**20
+"""Bytes that GDAL may hold: by itself it takes a twentieth of the machine."""
+
+OVERVIEW = 8
+"""Cells of the surface model along a cell of the overview that a painter is made from."""
 
 
-def raster_products(cloud: Cloud, out: Path, *, gsd: float, fill: int = 2) -> Surface:
+class Painter(Protocol):
+    """Gives the orthophoto its colours, for example from the photographs.
+
+    Attributes:
+        reach: how far around a window it looks at the surface, in the grid's unit.
+    """
+
+    @property
+    def reach(self) -> float: ...
+
+    def window(self, grid: Grid, surface: Grid, heights: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """RGB [rows, columns, 3] and alpha [rows, columns] of the cells of ``grid``, from the surface model over it and
+        ``reach`` around it, NaN where empty."""
+        ...
+
+
+PainterMaker = Callable[[Grid, NDArray], Painter]
+"""Makes a painter from a coarse overview of the whole surface: its grid and heights, NaN where empty."""
+
+
+def raster_products(
+    cloud: Tiles,
+    out: Path,
+    *,
+    gsd: float,
+    fill: int = 2,
+    painter: PainterMaker | None = None,
+    photo_cell: float | None = None,
+    window: int = WINDOW,
+) -> Grid:
     """Write ``dsm.tif`` and ``orthophoto.tif`` beside each other, as cloud-optimised GeoTIFFs.
 
     Args:
-        cloud: coloured points; its ``epsg`` becomes the files' CRS, None writes none.
+        cloud: coloured points; their ``epsg`` becomes the files' CRS, None writes none.
         out: folder.
         gsd: ground sampling distance in the cloud's unit; see :func:`cell_size`.
         fill: passes that close gaps of single cells.
+        painter: colours the orthophoto; None takes the mean colours of the points.
+        photo_cell: side of the orthophoto's cells with a painter, None: as the surface model's.
+        window: cells computed at once, each way; what is written does not depend on it.
 
     Returns:
-        The surface that was written.
+        The grid of the surface model.
 
     Raises:
         InputError: the cloud is empty, or its extent does not fit a raster (stray points or a wrong scale).
     """
     if len(cloud) == 0:
         raise InputError("The cloud holds no points, so there is no surface to draw: check the overlap of the images.")
-    grid = grid_over(cloud.points, cell_size(cloud, gsd), trim=0.0005)
-    if grid.rows * grid.columns > MAX_CELLS:
+    few = cloud.sample(SAMPLE)
+    grid = grid_over(few.points, cell_size(cloud.some(DENSITY), gsd), trim=0.0005)
+    if grid.rows * grid.columns > max(MAX_CELLS, EMPTIEST * len(cloud)):
         raise InputError(
             f"The surface would have {grid.rows} x {grid.columns} cells of {grid.cell:.3g}: the cloud's extent "
             "does not fit its resolution; check the cameras for strays."
         )
-    made = surface(cloud, grid, fill=fill)
-    heights = np.where(made.filled, made.heights, NODATA).astype(np.float32)
-    write_raster(out / "dsm.tif", heights[None], grid, cloud.epsg, nodata=NODATA)
-    if made.colors is not None:
-        alpha = (made.filled * 255).astype(np.uint8)
-        bands = np.concatenate([np.moveaxis(made.colors, -1, 0), alpha[None]])
-        write_raster(out / "orthophoto.tif", bands, grid, cloud.epsg)
-    return made
+    photo = out / "orthophoto.tif"
+    with _raster(out / "dsm.tif", grid, few.epsg, 1, "float32", nodata=NODATA) as heights:
+        if painter is None and few.colors is not None:
+            with _raster(photo, grid, few.epsg, 4, "uint8") as colors:
+                _draw(cloud, grid, fill, window, heights, colors)
+        else:
+            _draw(cloud, grid, fill, window, heights, None)
+        if painter is not None:
+            _paint(heights, grid, painter, photo_cell or grid.cell, photo, few.epsg, window)
+    return grid
 
 
-def cell_size(cloud: Cloud, gsd: float) -> float:
-    """Twice the GSD, or as much more as it takes for three points in a filled cell on average."""
-    spread = grid_over(cloud.points, 16 * gsd, trim=0.0005)
-    if spread.rows * spread.columns > MAX_CELLS:
+def cell_size(clouds: Sequence[Cloud], gsd: float) -> float:
+    """Twice the GSD, or as much more as it takes for three points in a filled cell on average.
+
+    Args:
+        clouds: the cloud, or some whole tiles of it.
+        gsd: ground sampling distance in their unit.
+    """
+    count = sum(len(cloud) for cloud in clouds)
+    spread = _hit(clouds, 16 * gsd)
+    if spread is None:
         return 2 * gsd
-    covered = spread.hit(cloud.points) * spread.cell**2
-    cell = max(2 * gsd, 0.5 * float(np.sqrt(3 * covered / len(cloud))))  # a first guess from below saves passes
-    while True:
-        grid = grid_over(cloud.points, cell, trim=0.0005)
-        if grid.rows * grid.columns > MAX_CELLS:
-            return cell
-        if 3 * (hit := grid.hit(cloud.points)) <= len(cloud) or hit == 1:
-            return cell
+    covered = spread * (16 * gsd) ** 2
+    cell = max(2 * gsd, 0.5 * float(np.sqrt(3 * covered / count)))  # a first guess from below saves passes
+    while (hit := _hit(clouds, cell)) is not None and 3 * hit > count and hit > 1:
         cell *= 1.25
+    return cell
 
 
-def write_raster(path: Path, bands: NDArray, grid: Grid, epsg: int | None, *, nodata: float | None = None) -> None:
-    """Write bands [C, rows, columns] as a tiled, deflated GeoTIFF with overviews; atomic.
+def _hit(clouds: Sequence[Cloud], cell: float) -> int | None:
+    """Cells with points in them, None where the extent is absurd."""
+    step = sum(len(cloud) for cloud in clouds) // 500_000 + 1
+    grid = grid_over(np.concatenate([cloud.points[::step] for cloud in clouds]), cell, trim=0.0005)
+    if grid.rows * grid.columns > 25 * MAX_CELLS:
+        return None
+    return grid.hit(*(cloud.points for cloud in clouds))
 
-    Four uint8 bands are red, green, blue and alpha.
+
+@dataclass(frozen=True)
+class Window:
+    """Rows and columns of a grid."""
+
+    whole: Grid
+    rows: slice
+    columns: slice
+
+    @property
+    def grid(self) -> Grid:
+        """Of these cells alone."""
+        cell = self.whole.cell
+        return Grid(
+            self.whole.x_min + self.columns.start * cell,
+            self.whole.y_max - self.rows.start * cell,
+            cell,
+            self.rows.stop - self.rows.start,
+            self.columns.stop - self.columns.start,
+        )
+
+    @property
+    def place(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """As rasterio writes it: (first and last row + 1, first and last column + 1)."""
+        return (self.rows.start, self.rows.stop), (self.columns.start, self.columns.stop)
+
+    def wide(self, cells: int) -> Window:
+        """With so many cells more on each side, as far as the grid goes."""
+        return Window(
+            self.whole,
+            slice(max(0, self.rows.start - cells), min(self.whole.rows, self.rows.stop + cells)),
+            slice(max(0, self.columns.start - cells), min(self.whole.columns, self.columns.stop + cells)),
+        )
+
+    def inside(self, wide: Window) -> tuple[slice, slice]:
+        """Where it lies in a wider one."""
+        row, column = wide.rows.start, wide.columns.start
+        return (
+            slice(self.rows.start - row, self.rows.stop - row),
+            slice(self.columns.start - column, self.columns.stop - column),
+        )
+
+
+def windows(grid: Grid, cells: int) -> Iterator[Window]:
+    """The windows of a grid, row by row from the north-west."""
+    for row in range(0, grid.rows, cells):
+        for column in range(0, grid.columns, cells):
+            rows = slice(row, min(row + cells, grid.rows))
+            yield Window(grid, rows, slice(column, min(column + cells, grid.columns)))
+
+
+def _draw(cloud: Tiles, grid: Grid, fill: int, cells: int, heights: Any, colors: Any | None) -> None:
+    """Write the surface and, if wanted, the mean colours of its points."""
+    for window in windows(grid, cells):
+        wide = window.wide(1 + fill)  # one cell for what stands apart, one for each pass that closes gaps
+        seen = surface(_points_in(cloud, wide.grid), wide.grid, fill=fill)
+        inner = window.inside(wide)
+        filled = seen.filled[inner]
+        if filled.any():
+            shown = np.where(filled, seen.heights[inner], NODATA).astype(np.float32)
+            heights.write(shown[None], window=window.place)
+            if colors is not None and seen.colors is not None:
+                colors.write(_bands(seen.colors[inner], (filled * 255).astype(np.uint8)), window=window.place)
+
+
+def _points_in(cloud: Tiles, grid: Grid) -> Cloud:
+    """What a surface needs of the points in a grid."""
+    x_min, x_max, y_min, y_max = grid.extent
+    low, high = np.array([x_min, y_min]) - grid.cell, np.array([x_max, y_max]) + grid.cell
+    found = [Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))]
+    for i, (least, most) in enumerate(cloud.bounds):
+        if (least[:2] <= high).all() and (most[:2] >= low).all():
+            tile = cloud.tile(i)
+            near = ((tile.points[:, :2] >= low) & (tile.points[:, :2] <= high)).all(1)
+            found.append(Cloud(tile.points[near], None if tile.colors is None else tile.colors[near]))
+    return concatenate(found)
+
+
+def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path, epsg: int | None, cells: int) -> None:
+    """Write the orthophoto in the colours of a painter, from the surface model that was written before."""
+    known = OVERVIEW * grid.cell
+    rows, columns = -(-grid.rows // OVERVIEW), -(-grid.columns // OVERVIEW)
+    coarse = np.full((rows, columns), np.nan, np.float32)
+    for row in range(rows):  # the middle of each cell; one row in memory, whatever the size of the map
+        at = min(row * OVERVIEW + OVERVIEW // 2, grid.rows - 1)
+        line = heights.read(1, window=((at, at + 1), (0, grid.columns)))[0]
+        picked = line[np.minimum(np.arange(columns) * OVERVIEW + OVERVIEW // 2, grid.columns - 1)]
+        coarse[row] = np.where(picked == NODATA, np.nan, picked)
+    painter = make(Grid(grid.x_min, grid.y_max, known, rows, columns), coarse)
+    x_min, x_max, y_min, y_max = grid.extent
+    left, top = np.floor(x_min / cell + 1e-6) * cell, np.ceil(y_max / cell - 1e-6) * cell
+    size = int(np.ceil((top - y_min) / cell - 1e-6)), int(np.ceil((x_max - left) / cell - 1e-6))
+    fine = Grid(float(left), float(top), cell, *size)
+    margin = int(np.ceil(painter.reach / grid.cell)) + 2
+    with _raster(path, fine, epsg, 4, "uint8") as photo:
+        for window in windows(fine, cells):
+            around = _over(grid, window.grid).wide(margin)
+            below = heights.read(1, window=around.place)
+            below = np.where(below == NODATA, np.nan, below)
+            if np.isfinite(below).any():
+                photo.write(_bands(*painter.window(window.grid, around.grid, below)), window=window.place)
+
+
+def _over(grid: Grid, part: Grid) -> Window:
+    """The cells of a grid that a part of another one touches; at least one."""
+    x_min, x_max, y_min, y_max = part.extent
+    rows = [int(np.floor((grid.y_max - y) / grid.cell)) for y in (y_max, y_min)]
+    columns = [int(np.floor((x - grid.x_min) / grid.cell)) for x in (x_min, x_max)]
+    (top, bottom), (left, right) = np.clip(rows, 0, grid.rows - 1), np.clip(columns, 0, grid.columns - 1)
+    return Window(grid, slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
+
+
+def _bands(colors: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.concatenate([np.moveaxis(colors, -1, 0), alpha[None]])
+
+
+@contextmanager
+def _raster(
+    path: Path, grid: Grid, epsg: int | None, count: int, kind: str, *, nodata: float | None = None
+) -> Iterator[Any]:
+    """A plain GeoTIFF to write windows into, which becomes a cloud-optimised one with overviews, atomically.
+
+    Four bands are red, green, blue and alpha.
     """
     import rasterio
     from rasterio.enums import ColorInterp
     from rasterio.shutil import copy
     from rasterio.transform import Affine
 
-    with rasterio.MemoryFile() as memory, replacing(path) as temporary:
-        with memory.open(
+    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE), replacing(path) as temporary:
+        plain = temporary.with_name("plain.tif")
+        with rasterio.open(
+            plain,
+            "w+",
             driver="GTiff",
             width=grid.columns,
             height=grid.rows,
-            count=len(bands),
-            dtype=bands.dtype,
+            count=count,
+            dtype=kind,
             crs=None if epsg is None else f"EPSG:{epsg}",
             transform=Affine(grid.cell, 0.0, grid.x_min, 0.0, -grid.cell, grid.y_max),
             nodata=nodata,
-        ) as source:
-            source.write(bands)
-            if len(bands) == 4:
-                source.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
-        with memory.open() as source:
-            predictor = 3 if bands.dtype.kind == "f" else 2
-            copy(source, temporary, driver="COG", compress="deflate", predictor=predictor)
+            tiled=True,
+            blockxsize=512,
+            blockysize=512,
+            sparse_ok=True,
+            bigtiff="if_safer",
+        ) as target:
+            if count == 4:
+                target.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
+            yield target
+        predictor = 3 if np.dtype(kind).kind == "f" else 2
+        with rasterio.open(plain) as source:
+            copy(source, temporary, driver="COG", compress="deflate", predictor=predictor, bigtiff="if_safer")

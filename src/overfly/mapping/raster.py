@@ -47,10 +47,14 @@ class Grid:
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         return np.where(inside, row * self.columns + column, -1)
 
-    def hit(self, points: ArrayLike) -> int:
-        """Number of cells that hold at least one of the points [N, >=2]."""
+    def hit(self, *points: ArrayLike) -> int:
+        """Number of cells that hold at least one of the points, each [N, >=2]."""
+        if self.rows * self.columns > 100_000_000:  # marks would fill the memory
+            found = np.unique(np.concatenate([np.unique(self.cells(p)) for p in points]))
+            return int(np.count_nonzero(found >= 0))
         marks = np.zeros(self.rows * self.columns + 1, bool)
-        marks[self.cells(points)] = True  # -1, outside, marks the spare last one
+        for some in points:
+            marks[self.cells(some)] = True  # -1, outside, marks the spare last one
         return int(np.count_nonzero(marks[:-1]))
 
     def centres(self) -> NDArray[np.float64]:
@@ -168,13 +172,23 @@ def _speckles(heights: NDArray[np.float64], step: float) -> NDArray[np.bool_]:
 
 
 def _fill(layers: NDArray[np.float64], passes: int) -> NDArray[np.float64]:
-    """Close small gaps in [rows, columns, C] from the neighbours' mean; NaN marks the gaps."""
-    from scipy.ndimage import uniform_filter
+    """Close small gaps in [rows, columns, C] from the neighbours' mean; NaN marks the gaps.
 
+    A cell's neighbours are always added in the same order, so that it gets the same value in every window.
+    """
+    rows, columns = layers.shape[:2]
+    around = [(down, right) for down in range(3) for right in range(3) if (down, right) != (1, 1)]
     for _ in range(passes):
-        known = np.isfinite(layers[..., 0])
-        share = uniform_filter(known.astype(float), 3, mode="constant")
-        sums = uniform_filter(np.where(known[..., None], layers, 0.0), (3, 3, 1), mode="constant")
-        with np.errstate(invalid="ignore", divide="ignore"):
-            layers = np.where(known[..., None] | (share < 2.9 / 9)[..., None], layers, sums / share[..., None])
+        padded = np.pad(layers, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+        known = np.isfinite(padded[..., 0])
+        count = np.zeros((rows, columns), np.int8)
+        for down, right in around:
+            count += known[down : down + rows, right : right + columns]
+        at_row, at_column = np.nonzero(~known[1:-1, 1:-1] & (count >= 3))
+        total = np.zeros((len(at_row), layers.shape[2]))
+        for down, right in around:
+            beside = padded[at_row + down, at_column + right]
+            total += np.where(np.isfinite(beside[:, :1]), beside, 0.0)
+        layers = padded[1:-1, 1:-1]
+        layers[at_row, at_column] = total / count[at_row, at_column, None]
     return layers

@@ -7,6 +7,7 @@ renamed when complete, so a kill at any time loses only the running step.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -22,7 +23,8 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from overfly.errors import InputError
+from overfly.errors import Damaged, InputError
+from overfly.files import UNREADABLE
 
 T = TypeVar("T")
 
@@ -42,6 +44,23 @@ def peak_memory_mb() -> float:
     """The most memory that this process or one of its children has held."""
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return largest / (1024 if sys.platform != "darwin" else 1024**2)
+
+
+def unwritable(error: OSError, folder: Path) -> str | None:
+    """Why nothing could be written, for the user; None where an error has another cause.
+
+    GDAL's errors have no number, so the disk is asked, too.
+    """
+    free = shutil.disk_usage(folder).free if folder.is_dir() else 0
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or "No space left" in str(error) or free < FULL:
+        return f"the disk is full ({free / 1e9:.1f} GB free), make room on it"
+    if error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
+        return f"{error.strerror} ({error.filename or folder}), give another folder by --out or the right to write"
+    return None
+
+
+FULL = 4_000_000
+"""Free bytes with which a disk counts as full."""
 
 
 class Steps:
@@ -89,15 +108,20 @@ class Steps:
             key: of all that the result depends on (:func:`key_of`).
             make: makes the result; gets a scratch folder of its own that survives a kill, for finished parts.
             write: writes it into a folder.
-            read: reads it from a folder.
+            read: reads it from a folder; what it cannot read is made anew.
         """
         place, scratch = self.folder / f"{step}-{key}", self.folder / f"{step}-{key}.scratch"
         if self.resume and place.is_dir():
-            with self.timed(step):
-                result = read(place)
-            self.reused.append(step)
-            self.say(step, "[dim]kept from the last run (same images, same settings)[/dim]")
-            return result
+            try:
+                with self.timed(step):
+                    result = read(place)
+            except (Damaged, *UNREADABLE):
+                self.say(step, f"{place.name} is damaged and made anew")
+                shutil.rmtree(place)
+            else:
+                self.reused.append(step)
+                self.say(step, "[dim]kept from the last run (same images, same settings)[/dim]")
+                return result
         if not self.resume:
             shutil.rmtree(scratch, ignore_errors=True)
         with self.timed(step):
@@ -110,6 +134,7 @@ class Steps:
             shutil.rmtree(place, ignore_errors=True)
             os.replace(part, place)
             shutil.rmtree(scratch, ignore_errors=True)
+            result = read(place)  # what a resumed map would work with, and not what lay in the scratch folder
         self._forget_old(step)
         return result
 

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.errors import InputError
+from overfly.errors import Damaged, InputError
+from overfly.files import UNREADABLE, load_arrays, save_arrays
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, project, unproject
 from overfly.mapping.coarse import coarse_points
@@ -83,7 +84,11 @@ def stereo(
             "No two frames see the same ground from places far enough apart for stereo: "
             "fly with 30 % overlap or more, or check the cameras."
         )
-    waiting = {i: [p for p in pairs if i in p] for i in range(len(frames))}
+    waiting: dict[int, list[tuple[int, int]]] = {i: [] for i in range(len(frames))}
+    for pair in pairs:
+        for i in pair:
+            waiting[i].append(pair)
+    _drop_damaged(workdir)
     maps: list[DepthMap] = []
     for i in range(len(frames)):
         path = workdir / f"depth-{i:05d}.npz"
@@ -109,6 +114,20 @@ def stereo(
         if progress:
             progress(i + 1, len(frames))
     return maps
+
+
+def _drop_damaged(workdir: Path) -> None:
+    """Remove what an earlier run left that cannot be read: it is made again."""
+    for path in workdir.glob("depth-*.npz"):
+        try:
+            load_arrays(path)
+        except Damaged:
+            path.unlink()
+    for path in workdir.glob("pair-*.npy"):
+        try:
+            np.load(path)
+        except UNREADABLE:
+            path.unlink()
 
 
 def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[tuple[float, float, float]]:
@@ -247,15 +266,13 @@ def _depth(
         full = {name: np.where(paired, values, filled[name]) for name, values in full.items()}
         sure = np.where((full["score"] >= SURE) & (full["support"] >= 1), full["depth"], np.float32(np.nan))
         opinion = opinion.settled(sure, flight.full[i], flight.poses[i])
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
-        np.savez(
-            file,
-            depth=full["depth"],
-            sigma=full["sigma"].astype(np.float16),
-            support=full["support"],
-            score=np.round(np.clip(np.nan_to_num(full["score"], nan=-1), -1, 1) * 100).astype(np.int8),
-            paired=paired,
-            **({} if opinion is None else {f"opinion_{name}": value for name, value in vars(opinion).items()}),
-        )
-    part.replace(path)
+    kept = {
+        "depth": full["depth"],
+        "sigma": full["sigma"].astype(np.float16),
+        "support": full["support"],
+        "score": np.round(np.clip(np.nan_to_num(full["score"], nan=-1), -1, 1) * 100).astype(np.int8),
+        "paired": paired,
+    }
+    if opinion is not None:
+        kept |= {f"opinion_{name}": value for name, value in vars(opinion).items()}
+    save_arrays(path, kept)

@@ -32,6 +32,9 @@ from overfly.rendering.topology import topology
 
 log = logging.getLogger("overfly")
 
+ROUGH_POINTS = 8_000_000
+"""Points that a rough mesh is made from, at most: some for each of the parts that its cells are cut into."""
+
 LEAST_WIDTH = 64
 """Of the photographs, pixels."""
 
@@ -159,7 +162,7 @@ class PhotographModule(L.LightningDataModule):
         if self.dense == "sweep":
             raise InputError("dense=sweep needs a trained network: map the flight first, or use data.dense=stereo.")
         flight, block, cloud = measure_flight(folder, **settings)
-        return flight, block, rough_mesh(cloud, faces=self.faces)
+        return flight, block, rough_mesh(cloud.sample(ROUGH_POINTS), faces=self.faces)
 
     def _flight_folder(self) -> Path:
         if self.flight is not None:

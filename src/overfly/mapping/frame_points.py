@@ -1,0 +1,186 @@
+"""Points of one frame's depth map: checked against the maps of its partners and averaged where they agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.cloud import Cloud
+from overfly.flights import Frame
+from overfly.geometry import unproject
+from overfly.mapping.depth_map import DepthMap
+from overfly.mapping.subpixel import Map, frame_to_frame
+
+GATE = 3.0
+"""Two depths of one place agree within this many standard deviations of their difference."""
+
+WORST_SCORE = {True: 0.2, False: 0.45}
+"""Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
+
+WIDEST = 2.0
+"""Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
+
+ISLAND = 40
+"""Connected pieces of depth with fewer pixels are speckle."""
+
+
+def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
+    """The map without badly correlated pixels and speckle."""
+    import cv2
+
+    data = depth_map.load()
+    depth = data["depth"]
+    threshold = np.where(data["support"] >= 2, WORST_SCORE[True], WORST_SCORE[False])
+    known = np.isfinite(depth) & (data["score"] >= threshold)
+    # Speckle is judged in steps of sigma along the inverse depth, where a slope is smooth.
+    middle = float(np.median(depth[known])) if known.any() else 1.0
+    unit = float(np.median((data["sigma"] / depth**2)[known])) if known.any() else 1.0
+    steps = np.clip(np.where(known, (1 / np.where(known, depth, middle) - 1 / middle) / unit, -30000), -30000, 30000)
+    labels = steps.astype(np.int16)
+    cv2.filterSpeckles(labels, -30000, ISLAND, 8)
+    known &= labels > -30000
+    depth = np.where(known, depth, np.float32(np.nan))
+    opinion = depth_map.opinion()
+    if opinion is None:
+        return {**data, "depth": depth}
+    size = depth.shape[::-1]
+    said, sigma, sure = (
+        cv2.resize(part, size, interpolation=cv2.INTER_LINEAR)
+        for part in (opinion.depth, opinion.sigma, opinion.confidence)
+    )
+    # Where nothing could be measured, the network's word stands.
+    guessed = ~known & np.isfinite(said)
+    return {
+        **data,
+        "depth": np.where(guessed, said, depth),
+        "sigma": np.where(guessed, sigma, data["sigma"]),
+        "support": np.where(guessed, 0, data["support"]).astype(np.uint8),
+        "guessed": guessed,
+        "second": guessed | ~data["paired"],
+        "sure": sure,
+    }
+
+
+def frame_points(
+    own: DepthMap,
+    data: Mapping[str, NDArray],
+    partners: Iterable[tuple[DepthMap, Mapping[str, NDArray], NDArray[np.bool_] | None]],
+    frame: Frame,
+    single: bool,
+) -> tuple[Cloud, NDArray[np.bool_], NDArray[np.bool_], float]:
+    """The points of one map that earlier maps have not given.
+
+    Args:
+        own, data: the map and its cleaned content.
+        partners: of each map that it is compared with, the map, its cleaned content and, if it was asked before this
+            one, the pixels [H, W] that it has given.
+        frame: it was made from, for the colours.
+        single: keep points that only one pair has seen.
+
+    Returns:
+        The points, which of them no pair has matched [N], which pixels are given now [H, W], and metres per pixel.
+    """
+    depth: Map = data["depth"]
+    sigma = data["sigma"]
+    guessed = data.get("guessed", np.zeros(depth.shape, bool))
+    second = data.get("second", guessed)
+    widest = WIDEST * depth / own.camera.fx
+    weight = 1 / sigma**2
+    total, mean = weight.copy(), weight * depth
+    agree, deny, seen = (np.zeros(depth.shape, np.uint8) for _ in range(3))
+    taken = np.zeros(depth.shape, bool)
+    for partner, other, before in partners:
+        found, spread, given, inside, theirs = _look_up(own, depth, partner, other, before)
+        # What pairs have matched is judged by what pairs have matched alone: the cloud of them is that of stereo.
+        found = np.where(theirs & ~second, np.float32(np.nan), found)
+        with np.errstate(invalid="ignore"):
+            gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
+            same = np.abs(found - depth) < gate
+            # The other frame looks through this point at something behind it.
+            deny += found - depth > gate
+        agree += same
+        seen += inside
+        taken |= same & given
+        w = np.where(same, 1 / spread**2, 0)
+        total += w
+        mean += np.where(same, w * found, 0)
+    # One pair alone must at least agree with itself, seen from its other frame.
+    votes = np.maximum(agree, data["support"])
+    known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
+    alone = guessed & (agree == 0)  # predicted: no other frame agrees
+    known |= alone
+    fresh = known & ~taken
+    merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
+    rows, columns = np.nonzero(fresh)
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    points = unproject(pixels, merged, own.camera, own.world_from_camera)
+    votes = votes[fresh]
+    image = _undistorted(frame, own)
+    cloud = Cloud(
+        points,
+        image[rows, columns],
+        confidence=np.where(
+            guessed[fresh],
+            data["sure"][fresh] if "sure" in data else 0,
+            _confidence(votes, agree[fresh], data["score"][fresh]),
+        ).astype(np.float32),
+        sigma_m=spread.astype(np.float32),
+        views=(1 + votes).astype(np.uint8),
+        predicted=alone[fresh],
+    )
+    measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
+    gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
+    return cloud, second[fresh], known, gsd
+
+
+def _look_up(
+    own: DepthMap, depth: Map, other: DepthMap, data: Mapping[str, NDArray], given: NDArray[np.bool_] | None
+) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given, whether
+    the other frame has the place inside at all, and whether no pair has matched it there."""
+    import cv2
+
+    q, t = frame_to_frame(own.camera, own.world_from_camera, other.camera, other.world_from_camera)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / depth
+        third = q[2] + inverse * t[2]
+        u = np.nan_to_num((q[0] + inverse * t[0]) / third - np.float32(0.5), nan=-9, posinf=-9, neginf=-9)
+        v = np.nan_to_num((q[1] + inverse * t[1]) / third - np.float32(0.5), nan=-9, posinf=-9, neginf=-9)
+    nan = float("nan")
+    there, spread = (
+        cv2.remap(data[name], u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
+        for name in ("depth", "sigma")
+    )
+    was, theirs = (
+        np.zeros(depth.shape, bool)
+        if mask is None
+        else cv2.remap(mask.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+        for mask in (given, data.get("second"))
+    )
+    inside = (u > 0) & (v > 0) & (u < other.camera.width - 1) & (v < other.camera.height - 1)
+    # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
+    return there / third, spread / third, was, inside, theirs
+
+
+def _undistorted(frame: Frame, own: DepthMap) -> NDArray[np.uint8]:
+    """The frame's image in the pixels of its depth map."""
+    import cv2
+
+    assert frame.camera is not None
+    lens = frame.camera.resized(own.camera.width, own.camera.height)
+    image = frame.image()
+    if image.shape[:2] != (lens.height, lens.width):
+        image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+    if not lens.is_distorted:
+        return image
+    matrix = lens.matrix()
+    matrix[:2, 2] -= 0.5
+    return np.asarray(cv2.undistort(image, matrix, lens.distortion))
+
+
+def _confidence(votes: NDArray, agree: NDArray, score: NDArray) -> NDArray[np.float32]:
+    """0..1 from the number of confirming pairs and maps and the correlation."""
+    base = np.select([(votes <= 1) & (agree == 0), agree == 0, agree == 1], [0.45, 0.7, 0.85], 0.95)
+    return (base * np.clip(0.4 + 0.7 * score, 0, 1)).astype(np.float32)

@@ -1,0 +1,98 @@
+"""One tile of the cloud from the points of all frames: one point per voxel, no strays, guesses only where needed.
+
+Voxels and the larger cells of the filters are counted from the frame's origin, and a tile's borders are borders of all
+of them: a point's fate depends on nothing but its neighbours, wherever tiles begin and end.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.cloud import Cloud, concatenate, voxel_thin
+
+CROWD = 8
+"""Voxels along a cell in which company is counted."""
+
+NEAR = 30
+"""Voxels along a cell of the plan, in which one matched point makes guesses needless: about ground pixels."""
+
+FEWEST = 6
+"""Points in a cell and its 26 neighbours, or they are stray."""
+
+LEAST_CONFIDENT = 0.5
+"""Points that no pair has matched are left out with less confidence: on a real flight most of those were wrong."""
+
+BLOCK = 120
+"""Voxels: tiles begin and end at multiples, at which the filters' cells do, too."""
+
+MARGIN = CROWD
+"""Voxels around a tile whose matched points its filters must know."""
+
+
+def thinned_tile(matched: Cloud, guesses: Cloud, size: float, low: NDArray, high: NDArray) -> Cloud:
+    """The finished points of a tile.
+
+    Args:
+        matched: all points that pairs have matched in the tile and :data:`MARGIN` voxels around it, in a fixed order.
+        guesses: all other points, of the tile alone.
+        size: side of a voxel.
+        low, high: [2], the tile's first voxel and the one behind its last, multiples of :data:`BLOCK`.
+    """
+    first, second = (thinned(cloud, size) for cloud in (matched, guesses))
+    first = first[accompanied(first.points, size)]
+    at = voxels(first.points, size)[:, :2]
+    first = first[((at >= low) & (at < high)).all(1)]
+    assert second.confidence is not None
+    second = second[second.confidence >= LEAST_CONFIDENT]
+    return concatenate([first, second[_elsewhere(second, first, size)]])
+
+
+def voxels(points: NDArray, size: float) -> NDArray[np.int64]:
+    """The voxel [N, 3] of each point [N, 3]."""
+    return np.floor(points / size).astype(np.int64)
+
+
+def thinned(cloud: Cloud, size: float) -> Cloud:
+    """The most confident point of each voxel; the first of equals."""
+    assert cloud.confidence is not None
+    cloud = cloud[np.argsort(-cloud.confidence, kind="stable")]
+    return cloud[voxel_thin(cloud.points, size)] if len(cloud) else cloud
+
+
+def accompanied(points: NDArray, size: float) -> NDArray[np.bool_]:
+    """Points whose cell and its 26 neighbours hold enough others not to be stray."""
+    if not len(points):
+        return np.ones(0, bool)
+    cells = voxels(points, size) // CROWD
+    cells -= cells.min(0) - 1
+    spans = cells.max(0) + 2
+    if np.prod(spans, dtype=float) >= 2**62:  # the flat number would overflow: points at absurd distances
+        cells = np.stack([_closed_up(c) for c in cells.T], axis=1)
+        spans = cells.max(0) + 2
+    flat = (cells[:, 0] * spans[1] + cells[:, 1]) * spans[2] + cells[:, 2]
+    known, owner, counts = np.unique(flat, return_inverse=True, return_counts=True)
+    around = np.zeros(len(known), np.int64)
+    for dx, dy, dz in product((-1, 0, 1), repeat=3):
+        beside = known + (dx * spans[1] + dy) * spans[2] + dz
+        at = np.minimum(np.searchsorted(known, beside), len(known) - 1)
+        around += np.where(known[at] == beside, counts[at], 0)
+    return np.asarray(around[owner.reshape(-1)] >= FEWEST)
+
+
+def _closed_up(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Whole numbers [N] with the gaps between them closed to one: who was beside whom stays so."""
+    known, owner = np.unique(values, return_inverse=True)
+    return np.asarray(np.concatenate([[1], 1 + np.cumsum(np.minimum(np.diff(known), 2))])[owner])
+
+
+def _elsewhere(guesses: Cloud, matched: Cloud, size: float) -> NDArray[np.bool_]:
+    """Guessed points in whose cell of the plan nothing was matched: what is measured needs no guess beside it."""
+    if not len(guesses) or not len(matched):
+        return np.ones(len(guesses), bool)
+    cells = [voxels(cloud.points[:, :2], size) // NEAR for cloud in (guesses, matched)]
+    low = np.minimum(*(c.min(0) for c in cells))
+    columns = int(max(c[:, 1].max() for c in cells) - low[1]) + 1
+    return ~np.isin(*((c[:, 0] - low[0]) * columns + c[:, 1] - low[1] for c in cells))
