@@ -14,6 +14,10 @@ from overfly.mapping.rectify import ordered, rectify
 
 LONGEST_SIDE = 320
 PAIRS = 24
+"""Frames of a short flight that are matched with their neighbours."""
+
+APART = 8
+"""In a long flight every so manieth is: its ground may lie high here and low there."""
 
 
 def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
@@ -29,7 +33,7 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     centres = np.array([np.asarray(f.world_from_camera)[:3, 3] for f in frames])
     found = []
-    step = max(1, len(frames) // PAIRS)
+    step = min(max(1, len(frames) // PAIRS), APART)
     for i in range(0, len(frames), step):
         near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")
         for j in [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]:

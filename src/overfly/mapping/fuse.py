@@ -22,7 +22,7 @@ from overfly.mapping.depth_map import DepthMap
 from overfly.mapping.frame_points import cleaned, frame_points
 from overfly.mapping.layout import Layout, laid_out, reach
 from overfly.mapping.parts import RECORD, Part, cloud_of, read_part, read_squares, write_part
-from overfly.mapping.thinning import MARGIN, thinned_tile, voxels
+from overfly.mapping.thinning import MARGIN, thinned_tile, voxels, within
 from overfly.mapping.tiles import Tiles, finished, write_tile, written_tile
 
 Progress = Callable[[int, int], None]
@@ -148,8 +148,8 @@ class _Fusion:
                 records = read_squares(self.path(k), numbers)
             at = voxels(records["points"][:, :2], layout.voxel)
             guessed = records["guessed"]
-            matched.append(records[~guessed & ((at >= low - MARGIN) & (at < high + MARGIN)).all(1)])
-            guesses.append(records[guessed & ((at >= low) & (at < high)).all(1)])
+            matched.append(records[~guessed & within(at, low - MARGIN, high + MARGIN)])
+            guesses.append(records[guessed & within(at, low, high)])
         return np.concatenate(matched), np.concatenate(guesses)
 
     def _partners(self, k: int) -> Iterator[tuple[DepthMap, dict[str, NDArray], NDArray[np.bool_] | None]]:

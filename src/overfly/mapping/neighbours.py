@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from overfly.geometry import Array, Camera, project, unproject
+from overfly.geometry import Array, Camera, unproject
 
 GRID = 8
 """Samples of a frame's ground along each side of the image."""
@@ -29,7 +29,7 @@ def choose_partners(
     """The partners of every frame, best first.
 
     Args:
-        cameras, poses: of n frames.
+        cameras, poses: of n frames; lenses are taken as undistorted.
         depths: median depth of each frame's ground, metres.
         count: most partners of a frame.
         ratio: smallest and largest base-to-height ratio.
@@ -39,37 +39,41 @@ def choose_partners(
         (a greedy set cover), so that the rim of a frame gets its partner, too, also at 30 % overlap.
     """
     centres = np.array([pose[:3, 3] for pose in poses])
-    return [_partners(i, cameras, poses, centres, depths[i], count, ratio) for i in range(len(cameras))]
+    lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras])
+    turns = np.array([pose[:3, :3] for pose in poses])
+    return [
+        _partners(i, cameras[i], poses[i], lenses, turns, centres, depths[i], count, ratio) for i in range(len(cameras))
+    ]
 
 
 def _partners(
     i: int,
-    cameras: Sequence[Camera],
-    poses: Sequence[Array],
+    camera: Camera,
+    world_from_camera: Array,
+    lenses: Array,
+    turns: Array,
     centres: Array,
     depth: float,
     count: int,
     ratio: tuple[float, float],
 ) -> list[int]:
-    camera, world_from_camera = cameras[i], poses[i]
     side = (np.arange(GRID) + 0.5) / GRID
     pixels = np.stack(np.meshgrid(side * camera.width, side * camera.height), -1).reshape(-1, 2)
     ground = unproject(pixels, np.full(len(pixels), depth), camera, world_from_camera)
     near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[: CANDIDATES + 1]
-    worth: dict[int, Array] = {}
-    for j in near.tolist():
-        if j == i:
-            continue
-        seen, _ = project(ground, cameras[j], poses[j])
-        with np.errstate(invalid="ignore"):
-            inside = ((seen > 0) & (seen < [cameras[j].width, cameras[j].height])).all(1)
-        here, there = ground - centres[i], ground - centres[j]
-        lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1)
-        cosine = np.einsum("ij,ij->i", here, there) / np.maximum(lengths, 1e-12)
-        base_to_height = 2 * np.tan(np.arccos(np.clip(cosine, -1, 1)) / 2)
-        value = np.where(inside, _value(base_to_height, ratio), 0.0)
-        if value.mean() > 0.02:
-            worth[j] = value
+    near = near[near != i]
+    there = ground - centres[near, None]  # [J, G, 3]
+    local = there @ turns[near]
+    fx, fy, cx, cy, width, height = lenses[near, :, None].swapaxes(0, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = local[..., 0] / local[..., 2] * fx + cx, local[..., 1] / local[..., 2] * fy + cy
+        inside = (local[..., 2] > 0) & (u > 0) & (u < width) & (v > 0) & (v < height)
+    here = ground - centres[i]
+    lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=2)
+    cosine = np.einsum("gk,jgk->jg", here, there) / np.maximum(lengths, 1e-12)
+    base_to_height = 2 * np.tan(np.arccos(np.clip(cosine, -1, 1)) / 2)
+    values = np.where(inside, _value(base_to_height, ratio), 0.0)
+    worth = {int(j): value for j, value in zip(near, values, strict=True) if value.mean() > 0.02}
     chosen: list[int] = []
     times = np.zeros(len(ground), int)
     while worth and len(chosen) < count:

@@ -20,6 +20,7 @@ from overfly.flights import Frame
 from overfly.geometry import Array, Camera, project, unproject
 from overfly.mapping.coarse import coarse_points
 from overfly.mapping.consensus import consensus
+from overfly.mapping.culling import Groups
 from overfly.mapping.depth_map import DepthMap, Map, Opinion
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.neighbours import choose_partners
@@ -37,6 +38,9 @@ DISPARITY_SIGMA = 0.4
 
 SURE = 0.6
 """Correlation from which on a refined depth is taken for measured before any other frame confirms it."""
+
+BESIDE = 24
+"""Nearest frames that tell the usual depths where a frame's own are not known."""
 
 REFINED_SIGMA = 0.25
 """The same after refinement, pixels of the full size."""
@@ -131,10 +135,14 @@ def _drop_damaged(workdir: Path) -> None:
 
 
 def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[tuple[float, float, float]]:
-    """Nearest, median and farthest depth of each frame's surface, with margins, from surface points [M, 3]."""
+    """Nearest, median and farthest depth of each frame's surface, with margins, from surface points [M, 3].
+
+    Frames with too few points inside them take the usual depths of the frames beside them.
+    """
+    groups = Groups(points)
     found: list[tuple[float, float, float] | None] = []
     for camera, pose in zip(cameras, poses):
-        pixels, depth = project(points, camera, pose)
+        pixels, depth = project(groups.near(camera, pose), camera, pose)
         with np.errstate(invalid="ignore"):
             inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
         if inside.sum() < 20:
@@ -144,13 +152,21 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
         # Roofs and tree tops have few key points: leave room above.
         margin = 0.15 * (high - low) + 0.02 * middle
         found.append((max(low - 1.5 * margin, 0.05 * middle), float(middle), float(high + margin)))
-    known = [f for f in found if f is not None]
-    if not known:
+    known = np.flatnonzero([f is not None for f in found])
+    if not len(known):
         raise InputError(
             "The surface points lie outside all frames: the cameras and the points do not belong together."
         )
-    usual = tuple(float(np.median([f[k] for f in known])) for k in range(3))
-    return [f or (usual[0], usual[1], usual[2]) for f in found]
+    centres = np.array([pose[:3, 3] for pose in poses])
+    ranges = np.array([f for f in found if f is not None])
+    settled = []
+    for i, own in enumerate(found):
+        if own is None:
+            away = np.linalg.norm(centres[known] - centres[i], axis=1)
+            low, middle, high = np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0)
+            own = (float(low), float(middle), float(high))
+        settled.append(own)
+    return settled
 
 
 def _sample(depth: Map, camera: Camera, world_from_camera: Array, step: int = 8) -> Array:

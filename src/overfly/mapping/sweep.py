@@ -11,6 +11,7 @@ import numpy as np
 from overfly.data.footprints import footprint
 from overfly.data.windows import height_range, window_frame, window_sample
 from overfly.geometry import Array, Camera, project
+from overfly.mapping.culling import Groups
 from overfly.mapping.depth_map import Opinion
 from overfly.mapping.views import Views
 
@@ -55,7 +56,8 @@ class SweepOpinions:
     def __init__(
         self, run: TrainedRun, views: Views, points: Array, *, ground_height: float | None = None, metric: bool = True
     ) -> None:
-        self.network, self.views, self.points, self.metric = run.network.eval(), views, points, metric
+        self.network, self.views, self.metric = run.network.eval(), views, metric
+        self.groups = Groups(points)
         self.ground_height = ground_height
         self.cameras = [octave_camera(camera, run.network.size) for camera in views.full]
         self._image = lru_cache(maxsize=16)(lambda i: views.small(i, self.cameras[i]))
@@ -120,10 +122,11 @@ class SweepOpinions:
     def _around(self, i: int) -> Array:
         """Heights of the surface points in a frame, of all if there are few."""
         camera, pose = self.views.full[i], self.views.poses[i]
-        pixels, _ = project(self.points, camera, pose)
+        near = self.groups.near(camera, pose)
+        pixels, _ = project(near, camera, pose)
         with np.errstate(invalid="ignore"):
             inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
-        return self.points[inside, 2] if inside.sum() >= FEWEST else self.points[:, 2]
+        return near[inside, 2] if inside.sum() >= FEWEST else self.groups.points[:, 2]
 
 
 def octave_camera(camera: Camera, size: tuple[int, int]) -> Camera:

@@ -43,11 +43,15 @@ def thinned_tile(matched: Cloud, guesses: Cloud, size: float, low: NDArray, high
     """
     first, second = (thinned(cloud, size) for cloud in (matched, guesses))
     first = first[accompanied(first.points, size)]
-    at = voxels(first.points, size)[:, :2]
-    first = first[((at >= low) & (at < high)).all(1)]
+    first = first[within(voxels(first.points, size), low, high)]
     assert second.confidence is not None
     second = second[second.confidence >= LEAST_CONFIDENT]
     return concatenate([first, second[_elsewhere(second, first, size)]])
+
+
+def within(at: NDArray[np.int64], low: NDArray, high: NDArray) -> NDArray[np.bool_]:
+    """Which voxels [N, >=2] lie in a tile."""
+    return np.asarray(((at[:, :2] >= low) & (at[:, :2] < high)).all(1))
 
 
 def voxels(points: NDArray, size: float) -> NDArray[np.int64]:
