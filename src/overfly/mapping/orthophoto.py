@@ -1,0 +1,266 @@
+"""The orthophoto: every cell of the surface model in the colour of the photograph that sees it best.
+
+Which frames see a cell is told by a depth test (:mod:`overfly.mapping.sight`); among them, a frame is worth the more,
+the steeper it looks down, the farther the cell is from the image's border, and the sharper the image is. Exposures are
+evened out first (:mod:`overfly.mapping.gains`), seams then (:mod:`overfly.mapping.blend`).
+
+Windows agree to the last bit, if each is given the surface as far as :meth:`Orthophoto.halo` around it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from overfly.errors import InputError
+from overfly.geodesy import Origin
+from overfly.geometry import Camera
+from overfly.mapping.blend import BLOCK, Canvas
+from overfly.mapping.gains import balance
+from overfly.mapping.lattice import STEP, Chunk, Map, anchor, chunks, on_finer, placing
+from overfly.mapping.raster import Grid
+from overfly.mapping.sight import DepthBuffer, Sight, walls
+from overfly.mapping.visibility import Image, View
+
+MARGIN = 6
+"""Blocks computed around a window: one for filling, two each for the tone and for the votes, one for masks' filters."""
+
+FILL = 12
+"""A cell that no frame sees takes its neighbours' colour if a surely seen one is at most this many cells away."""
+
+FILLED = 254
+"""Alpha of such cells: opaque to the eye, and yet told from photographed ones (255) and from empty ones (0)."""
+
+SURE = 0.02
+"""Worth up to which a frame may well show the edge of what hides the cell instead of the cell."""
+
+HEM, SOFT = 9, 5
+"""Kernels, in cells, by which a frame's mask shrinks from what is hidden from it, and is then smoothed."""
+
+EDGE = 8
+"""Cells around a frame's box in which the filters of its mask may look."""
+
+RAMP = 4
+"""A frame has its full weight from 1 / RAMP of the image's side from the border on."""
+
+NADIR = 0.5
+"""Tangent off the vertical at which a frame is worth half of one that looks straight down."""
+
+
+class Orthophoto:
+    """Photographs laid on a surface.
+
+    Args:
+        frames: with cameras and poses in the block's frame, z up. All images are read once here, for the gains.
+        overview: grid of the whole surface, coarse: an eighth of the surface model's resolution is plenty.
+        heights: [rows, columns] of the overview, NaN where empty.
+        origin: given, grids and heights are in its projected CRS (``origin.crs_epsg``); None, in the block's frame.
+        image_mb: megabytes of decoded images that are kept from window to window.
+
+    Attributes:
+        gains: of the frames, see :class:`overfly.mapping.gains.Gains`.
+
+    Raises:
+        InputError: the overview is empty, no frame stands above it, or an image cannot be decoded.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[View],
+        overview: Grid,
+        heights: NDArray,
+        *,
+        origin: Origin | None = None,
+        image_mb: float = 512,
+    ) -> None:
+        known = np.isfinite(heights)
+        if not known.any():
+            raise InputError("The surface model is empty, so there is no orthophoto: check the overlap of the images.")
+        self._place, self._level = placing(origin), float(np.median(heights[known]))
+        xyz = np.concatenate([overview.centres()[known], heights[known][:, None]], axis=1)
+        points = self._place(xyz)
+        # Single strays would tell of towers that are not there.
+        low, high = np.quantile(points[:, 2], [0.001, 0.999])
+        margin = 0.02 * (high - low) + 2 * overview.cell
+        self._low, self._high = float(low - margin), float(high + margin)
+        self.frames, self._sights = [], []
+        for frame in frames:
+            if frame.camera is not None and frame.world_from_camera is not None:
+                pose = np.asarray(frame.world_from_camera, float)
+                if pose[2, 3] > self._low:
+                    self.frames.append(frame)
+                    self._sights.append(Sight(frame.camera, pose, self._low, self._high))
+        if not self.frames:
+            raise InputError("No frame stands above the surface: check that cameras and surface model belong together.")
+        self.gains = balance(self.frames, [s.outline for s in self._sights], points)
+        self._tree = shapely.STRtree([s.outline for s in self._sights])
+        self._reach = (self._high - self._low) * max(s.steepest for s in self._sights) + 2 * overview.cell
+        self._images: OrderedDict[tuple[int, float], Image] = OrderedDict()
+        self._image_bytes = image_mb * 1e6
+
+    def halo(self, cell: float) -> float:
+        """How far around a window of cells of that size the surface is needed, in the grids' unit.
+
+        As far as the highest surface can hide the lowest one, and the cells that tones and masks are averaged over.
+        """
+        return self._reach + (MARGIN + 1) * BLOCK * cell
+
+    def window(self, grid: Grid, surface: Grid, heights: NDArray) -> tuple[Image, NDArray[np.uint8]]:
+        """The orthophoto of one window.
+
+        Args:
+            grid: the cells wanted, of any size; usually one GSD.
+            surface: the surface model's grid over the window and its :meth:`halo`, as far as the surface goes.
+                The cells of both should stand on multiples of their size, or windows agree but for rounding.
+            heights: [rows, columns] of ``surface``, NaN where empty.
+
+        Returns:
+            RGB [rows, columns, 3] and alpha [rows, columns], both uint8: 255 where a photograph sees the cell,
+            :data:`FILLED` where none does and the colour is that of a neighbour on the same surface, at most
+            :data:`FILL` cells away; 0, and black, where the surface is empty, and where it is farther from all that is
+            seen: there no photograph tells the colour.
+        """
+        wide, inner = _widened(grid)
+        fine = on_finer(heights, surface, wide)
+        parts = list(chunks(wide, self._place, self._level))
+        ground = list(chunks(surface, self._place, self._level))
+        steps = walls(heights, surface.cell, ground)
+        canvas = Canvas(wide.rows, wide.columns)
+        window, near = shapely.union_all([p.outline for p in parts]), EDGE * grid.cell
+        for i in sorted(self._tree.query(window, predicate="dwithin", distance=near).tolist()):
+            sight = self._sights[i]
+            mine = [p for p in parts if sight.touches(p, near) and np.isfinite(fine[p.rows, p.columns]).any()]
+            if mine:
+                around = [p for p in ground if sight.touches(p, near)]
+                stood = [w for w in steps if sight.touches(w.chunk, near)]
+                self._draw(i, wide.cell, fine, mine, sight.buffer(heights, surface.cell, around, stood), canvas)
+        rgb, worth = canvas.blended()
+        filled = _fill(rgb, worth, fine, np.float32(STEP * surface.cell))
+        alpha = np.where(worth > 0, 255, np.where(filled, FILLED, 0)).astype(np.uint8)
+        return np.ascontiguousarray(np.moveaxis(rgb, 0, -1)[inner]), alpha[inner].copy()
+
+    def _draw(self, i: int, cell: float, fine: Map, parts: list[Chunk], depths: DepthBuffer, canvas: Canvas) -> None:
+        """Draw frame ``i`` on the canvas where it sees the surface [rows, columns] of heights ``fine``."""
+        import cv2
+
+        sight = self._sights[i]
+        image, camera = self._image(i, cell)
+        top, left = min(p.rows.start for p in parts), min(p.columns.start for p in parts)
+        free = np.full(
+            (max(p.rows.stop for p in parts) - top, max(p.columns.stop for p in parts) - left), 255, np.uint8
+        )
+        looks = []
+        for part in parts:
+            u, v, depth, slope = sight.ideal(part, part.x[None, :], part.y[:, None], fine[part.rows, part.columns])
+            x, y = sight.pixels(u, v, camera)
+            with np.errstate(invalid="ignore"):
+                edge = np.minimum(
+                    np.minimum(x, camera.width - x) / np.float32(camera.width),
+                    np.minimum(y, camera.height - y) / np.float32(camera.height),
+                )
+                if not (edge > 0).any():
+                    continue
+                fineness = np.minimum(1, np.float32(cell * camera.fx) / depth)
+                value = np.clip(RAMP * edge, 0, 1) * fineness / (1 + slope / np.float32(NADIR**2))
+            here = (
+                slice(part.rows.start - top, part.rows.stop - top),
+                slice(part.columns.start - left, part.columns.stop - left),
+            )
+            free[here][depths.hides(u, v, depth)] = 0
+            looks.append((part, here, x - np.float32(0.5), y - np.float32(0.5), np.where(value > 0, value, 0)))
+        soft = _feathered(free) * np.float32(np.clip(self.gains.sharpness[i], 0.1, 1))
+        canvas.begin()
+        for part, here, x, y, value in looks:
+            worth = value * soft[here]
+            if (worth > 0).any():
+                colors = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+                canvas.draw((part.rows, part.columns), np.stack(cv2.split(colors)), worth)
+
+    def _image(self, i: int, cell: float) -> tuple[Image, Camera]:
+        """A frame in its gains, and its camera; made smaller where its pixels are finer than cells."""
+        import cv2
+
+        frame, sight = self.frames[i], self._sights[i]
+        lens = frame.camera
+        assert lens is not None
+        key = i, cell
+        if key not in self._images:
+            image = frame.image()
+            factor = sight.gsd / cell * lens.width / image.shape[1]
+            if factor < 0.67:
+                size = max(2, round(image.shape[1] * factor)), max(2, round(image.shape[0] * factor))
+                image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+            table = np.clip(np.rint(np.arange(256)[:, None] * self.gains.colors[i]), 0, 255).astype(np.uint8)
+            self._images[key] = np.asarray(cv2.LUT(image, table[None]))
+            while len(self._images) > 1 and sum(m.nbytes for m in self._images.values()) > self._image_bytes:
+                self._images.popitem(last=False)
+        self._images.move_to_end(key)
+        image = self._images[key]
+        return image, lens.resized(image.shape[1], image.shape[0])
+
+
+def _widened(grid: Grid) -> tuple[Grid, tuple[slice, slice]]:
+    """The grid grown to whole blocks, counted from zero, and :data:`MARGIN` more each way; and where the grid lies."""
+    left, rest_x = anchor(grid.x_min, grid.cell)
+    top, rest_y = anchor(-grid.y_max, grid.cell)
+    begin, first = (left // BLOCK - MARGIN) * BLOCK, (top // BLOCK - MARGIN) * BLOCK
+    columns = (-(-(left + grid.columns) // BLOCK) + MARGIN) * BLOCK - begin
+    rows = (-(-(top + grid.rows) // BLOCK) + MARGIN) * BLOCK - first
+    wide = Grid(begin * grid.cell + rest_x, -(first * grid.cell) - rest_y, grid.cell, rows, columns)
+    return wide, (slice(top - first, top - first + grid.rows), slice(left - begin, left - begin + grid.columns))
+
+
+def _feathered(free: NDArray[np.uint8]) -> Map:
+    """Factors 0..1 from a mask of 255 where nothing hides the cells: 0 where hidden, and little beside that.
+
+    The cells beside are the edges of roofs, of which this frame may be the only one to see anything.
+    """
+    import cv2
+
+    # Beyond the box lies what the image does not show: free in any window.
+    padded = cv2.medianBlur(np.pad(free, EDGE, constant_values=255), 5)
+    soft = cv2.blur(cv2.erode(padded, np.ones((HEM, HEM), np.uint8)), (SOFT, SOFT))
+    factor = np.where(padded > 0, np.maximum(soft, int(255 * SURE)), 0) / np.float32(255)
+    return np.asarray(factor[EDGE:-EDGE, EDGE:-EDGE])
+
+
+def _fill(rgb: NDArray[np.uint8], worth: Map, heights: Map, step: np.float32) -> NDArray[np.bool_]:
+    """Give cells of the surface that no frame sees the mean colour of their neighbours at like height.
+
+    Args:
+        rgb: [3, rows, columns], altered in place.
+        worth: [rows, columns], of the best frame; 0 where none sees the cell.
+        heights: [rows, columns], NaN where empty.
+        step: difference of heights between two surfaces.
+
+    Returns:
+        The cells that were given a colour [rows, columns].
+    """
+    import cv2
+
+    unseen = (worth == 0) & np.isfinite(heights)
+    near = cv2.dilate(unseen.astype(np.uint8), np.ones((2 * FILL + 1, 2 * FILL + 1), np.uint8)) > 0
+    # Sure colours must first find their way over the unsure ones, which are not altered.
+    unsure = near & (worth < SURE) & np.isfinite(heights)
+    unsure[[0, -1]] = unsure[:, [0, -1]] = False
+    source, known, z = rgb.copy().reshape(3, -1), ((worth > 0) & ~unsure).ravel(), heights.reshape(-1)
+    blank = np.flatnonzero(unsure)
+    for _ in range(FILL):
+        total, count = np.zeros((3, len(blank)), np.int64), np.zeros(len(blank), np.int64)
+        for beside in [down * heights.shape[1] + right for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]:
+            other = blank + beside
+            with np.errstate(invalid="ignore"):
+                good = known[other] & (np.abs(z[other] - z[blank]) <= step)
+            total[:, good] += source[:, other[good]]
+            count += good
+        found = count > 0
+        source[:, blank[found]] = (total[:, found] + count[found] // 2) // count[found]
+        known[blank[found]] = True
+        blank = blank[~found]
+    filled = unseen & known.reshape(unseen.shape)
+    np.copyto(rgb, source.reshape(rgb.shape), where=filled)
+    return filled
