@@ -139,7 +139,10 @@ def map_(
     matcher: Annotated[str, typer.Option(help="Of key points: sift, encoder (of the network) or both.")] = "sift",
     dense: Annotated[str, typer.Option(help="sweep (network and stereo together) or stereo alone.")] = "sweep",
     size: Annotated[int, typer.Option(help="Longest side at which images are matched, pixels.")] = 1600,
-    max_memory: Annotated[float | None, typer.Option(help="Memory for the dense step, GB.")] = None,
+    max_memory: Annotated[
+        float | None,
+        typer.Option(help="Memory for dense cloud and products, GB. Default: half of what is free, at most 6."),
+    ] = None,
     resume: Annotated[bool, typer.Option(help="Reuse finished steps of an interrupted map in --out.")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another flight's map in --out.")] = False,
     ply: Annotated[bool, typer.Option("--ply", help="Write cloud.ply too.")] = False,

@@ -20,7 +20,7 @@ from overfly.mapping.block import Block
 from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
 from overfly.mapping.gallery import gallery, upright
-from overfly.mapping.products import raster_products
+from overfly.mapping.products import WINDOW, raster_products
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Caution, duration, write_report
 from overfly.mapping.settings import MapSettings
@@ -35,7 +35,16 @@ SAMPLE = 2_000_000
 """Points that tell figures and make pictures: all of a small flight."""
 
 
-def deliver(flight: Flight, block: Block, local: Tiles, out: Path, asked: MapSettings, steps: Steps) -> dict[str, Any]:
+def deliver(
+    flight: Flight,
+    block: Block,
+    local: Tiles,
+    out: Path,
+    asked: MapSettings,
+    steps: Steps,
+    *,
+    window: int = WINDOW,
+) -> dict[str, Any]:
     """Write every product of a finished cloud into ``out`` and return the content of ``map.json``.
 
     Args:
@@ -45,6 +54,7 @@ def deliver(flight: Flight, block: Block, local: Tiles, out: Path, asked: MapSet
         out: folder of the results.
         asked: the settings.
         steps: timing and messages.
+        window: cells of the rasters that are computed at once, each way.
 
     Raises:
         InputError: the cloud is empty, or its extent fits no raster.
@@ -66,7 +76,7 @@ def deliver(flight: Flight, block: Block, local: Tiles, out: Path, asked: MapSet
         for name in ("dsm.tif", "orthophoto.tif"):
             (out / name).unlink(missing_ok=True)
         if level:
-            raster_products(placed, out, gsd=gsd)
+            raster_products(placed, out, gsd=gsd, window=window)
             written += ["dsm.tif", "orthophoto.tif"]
         written += ["transforms.json", "map.json"]
     steps.say("products", ", ".join(written[:-1]))

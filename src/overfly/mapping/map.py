@@ -16,7 +16,7 @@ from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
-from overfly.mapping.needs import memory_gb
+from overfly.mapping.needs import Budget, allowed_gb, budget, least_gb
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
@@ -40,7 +40,7 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
     flight, steps, identity, asked = _opened(flight_folder, out, settings)
     with _told_when_stopped(steps):
         block, local = _measured(flight, identity, asked, steps)
-        return deliver(flight, block, local, Path(out), asked, steps)
+        return deliver(flight, block, local, Path(out), asked, steps, window=memory_budget(block, asked).window)
 
 
 def align_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> tuple[Flight, Block]:
@@ -129,12 +129,20 @@ def check_memory(block: Block, asked: MapSettings) -> None:
     Raises:
         InputError: more than ``max_memory_gb`` would be needed.
     """
-    needed = memory_gb((camera.width, camera.height) for camera in block.cameras)
+    sizes = [(camera.width, camera.height) for camera in block.cameras]
+    needed = least_gb(sizes, asked.size, network=asked.dense == "sweep")
     if asked.max_memory_gb is not None and needed > asked.max_memory_gb:
         raise InputError(
-            f"Mapping these {len(block.frames)} images takes about {needed:.1f} GB, more than --max-memory "
-            f"{asked.max_memory_gb:g}: allow {np.ceil(needed):.0f}, or map a part of the images or smaller ones."
+            f"Mapping images of this size takes {np.ceil(10 * needed) / 10:.1f} GB at the least, more than "
+            f"--max-memory {asked.max_memory_gb:g}: allow so much, or match at a smaller --size than {asked.size}."
         )
+
+
+def memory_budget(block: Block, asked: MapSettings) -> Budget:
+    """How much is held at once, so that the map keeps to the memory that it may take."""
+    sizes = [(camera.width, camera.height) for camera in block.cameras]
+    may = allowed_gb() if asked.max_memory_gb is None else asked.max_memory_gb
+    return budget(sizes, may, asked.size, network=asked.dense == "sweep")
 
 
 def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Block:
@@ -183,6 +191,7 @@ def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinio
     from overfly.mapping.fuse import fuse
     from overfly.mapping.stereo import stereo
 
+    held = memory_budget(block, asked)
     with steps.bar("dense", "depth maps") as update:
         maps = stereo(
             block.frames,
@@ -194,7 +203,15 @@ def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinio
             progress=update,
         )
     with steps.bar("dense", "fused") as update, steps.bar("dense", "tiles") as update_tiles:
-        return fuse(maps, block.frames, workdir=scratch, progress=update, progress_of_tiles=update_tiles)
+        return fuse(
+            maps,
+            block.frames,
+            workdir=scratch,
+            tile_points=held.tile_points,
+            held=held.held_maps,
+            progress=update,
+            progress_of_tiles=update_tiles,
+        )
 
 
 def ground_height(block: Block, flight: Flight, seed: int) -> float:

@@ -1,22 +1,125 @@
-"""What a map costs: memory and time by the size of its images, at measured rates; nothing heavy is imported."""
+"""What a map costs: memory and time by the size of its images, at measured rates; nothing heavy is imported.
+
+The memory of the dense step and the products does not grow with the number of images: a few of them are held, and one
+tile of the cloud. How many and how large follows from what is allowed (:func:`budget`).
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
-
-MEMORY_GB, MEMORY_GB_PER_MEGAPIXEL = 1.0, 0.04
-"""Measured on real flights: a fixed part, and one for each megapixel of all images."""
+from dataclasses import dataclass
+from pathlib import Path
 
 CORE_SECONDS_PER_MEGAPIXEL = 100 / (18 * 1.6 * 0.9)
 """Of a map with estimated cameras: 100 core-seconds for 18 images of 1600 x 900, measured."""
 
+FIXED_GB, NETWORK_GB = 0.3, 1.3
+"""The program itself, and a network with its windows; measured."""
 
-def memory_gb(sizes: Iterable[tuple[int, int]]) -> float:
-    """Memory that the map of images of these widths and heights (pixels) takes, GB."""
-    return MEMORY_GB + MEMORY_GB_PER_MEGAPIXEL * sum(width * height for width, height in sizes) / 1e6
+DECODED = 8
+"""Bytes per pixel of the image that is being read."""
+
+MATCHED, COMPARED, HELD = 270, 160, 24
+"""Bytes per matched pixel: while pairs are matched, while depth maps are compared, and of each map held; measured."""
+
+PER_POINT = 280
+"""Bytes per point of a tile while it is thinned, measured; rasters and pictures take less."""
+
+SHARE = 0.2
+"""Points per matched pixel that the frames give before thinning."""
+
+TILE_POINTS = (250_000, 4_000_000)
+"""Points of the smallest and the largest tile: smaller ones are mostly margin, larger ones gain nothing."""
+
+HELD_MAPS = (3, 8)
+"""Fewest and most depth maps in memory: with three, most are read more often."""
+
+MOST_GB = 6.0
+"""What a map takes at most if nobody says how much it may."""
 
 
-def core_seconds(sizes: Iterable[tuple[int, int]], matched_side: int = 1600) -> float:
+@dataclass(frozen=True)
+class Budget:
+    """How much is in memory at once.
+
+    Attributes:
+        tile_points: of a tile, before thinning.
+        held_maps: depth maps.
+        window: cells along a window of the rasters.
+    """
+
+    tile_points: int
+    held_maps: int
+    window: int
+
+
+Sizes = Iterable[tuple[int, int]]
+"""Widths and heights of images, pixels."""
+
+
+def budget(sizes: Sizes, allowed_gb: float, matched_side: int = 1600, *, network: bool = True) -> Budget:
+    """What fits into ``allowed_gb``; the smallest possible if nothing does (:func:`least_gb`)."""
+    fixed, largest, _ = _parts(sizes, matched_side, network)
+    room = (allowed_gb - fixed) * 1e9
+    maps = int((room / max(largest, 1) - COMPARED) / HELD)
+    return Budget(
+        int(min(max(room / PER_POINT, TILE_POINTS[0]), TILE_POINTS[1])),
+        min(max(maps, HELD_MAPS[0]), HELD_MAPS[1]),
+        1024 if room > 1e9 else 512,
+    )
+
+
+def memory_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
+    """Memory that a map takes if enough is there, GB."""
+    return _needed(sizes, matched_side, network, TILE_POINTS[1], HELD_MAPS[1])
+
+
+def least_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
+    """Memory that a map takes with the smallest tiles and the fewest images in memory, GB."""
+    return _needed(sizes, matched_side, network, TILE_POINTS[0], HELD_MAPS[0])
+
+
+def allowed_gb() -> float:
+    """What a map may take if nobody says: half of what is free, at most :data:`MOST_GB`."""
+    return min(MOST_GB, 0.5 * free_gb())
+
+
+def free_gb() -> float:
+    """Free memory of the machine, or of the container that limits it; all of it where the system does not say."""
+    try:
+        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        free = int(lines["MemAvailable"].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        group = Path("/sys/fs/cgroup")
+        limit = int((group / "memory.max").read_text())  # "max" where there is none
+        free = min(free, limit - int((group / "memory.current").read_text()))
+    except (OSError, ValueError):
+        pass
+    return max(free, 0) / 1e9
+
+
+def core_seconds(sizes: Sizes, matched_side: int = 1600) -> float:
     """Time that the map takes on one core, if images are matched at a longest side of ``matched_side`` pixels."""
-    pixels = sum(width * height * min(1.0, matched_side / max(width, height)) ** 2 for width, height in sizes)
-    return CORE_SECONDS_PER_MEGAPIXEL * pixels / 1e6
+    return CORE_SECONDS_PER_MEGAPIXEL * sum(_matched(size, matched_side) for size in sizes) / 1e6
+
+
+def _needed(sizes: Sizes, matched_side: int, network: bool, tile_points: int, held: int) -> float:
+    fixed, largest, total = _parts(sizes, matched_side, network)
+    tile = PER_POINT * min(tile_points, SHARE * total)
+    return fixed + max(MATCHED * largest, (COMPARED + HELD * held) * largest, tile) / 1e9
+
+
+def _parts(sizes: Sizes, matched_side: int, network: bool) -> tuple[float, float, float]:
+    """GB that are always there, pixels of the largest matched image, and pixels of all."""
+    sizes = list(sizes)
+    matched = [_matched(size, matched_side) for size in sizes]
+    decoded = max((width * height for width, height in sizes), default=0) * DECODED / 1e9
+    return FIXED_GB + decoded + (NETWORK_GB if network else 0.0), max(matched, default=0.0), sum(matched)
+
+
+def _matched(size: tuple[int, int], side: int) -> float:
+    """Pixels of an image as it is matched."""
+    return size[0] * size[1] * min(1.0, side / max(size)) ** 2

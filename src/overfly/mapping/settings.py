@@ -27,7 +27,7 @@ class MapSettings:
         network: the trained run (``overfly.run.load_run``); needed by "sweep" and by the matcher
             "encoder", unused by "stereo" and "sift".
         network_name: what the user called it.
-        max_memory_gb: memory that the dense step may take; None: no limit.
+        max_memory_gb: memory that the dense step and the products may take; None: half of what is free, at most 6.
         resume: reuse finished steps of an earlier map of the same images with the same settings.
         overwrite: replace another flight's map in the same folder.
         ply: write ``cloud.ply`` too.
