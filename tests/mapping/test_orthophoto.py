@@ -12,7 +12,8 @@ import pytest
 
 from overfly.errors import InputError
 from overfly.geodesy import Origin, crs_from_enu, enu_from_crs
-from overfly.mapping.orthophoto import FILL, FILLED, Orthophoto
+from overfly.mapping.fill import FILL, FILLED
+from overfly.mapping.orthophoto import Orthophoto
 from overfly.mapping.raster import Grid
 from overfly.mapping.sight import DepthBuffer
 
@@ -90,7 +91,7 @@ def test_one_frame_alone_leaves_blank_what_it_does_not_see(tmp_path: Path) -> No
     xy = FINE.centres()
     # From 16 m to the west the eastern edge of the roof, 22 m off, hides 22 * 8 / 42 m of the ground.
     shadow = (xy[..., 0] > 6) & (xy[..., 0] < 6 + 22 * 8 / 42) & (np.abs(xy[..., 1]) < 4)
-    deep = shadow & (np.abs(xy[..., 1]) < 4 - FILL * 0.125 - 0.5) & (alpha < 255)
+    deep = shadow & (np.abs(xy[..., 1]) < 4 - 2 * FILL * 0.125 - 0.5) & (alpha < 255)
     assert deep.any()
     assert (alpha[deep] == 0).all()
     assert not rgb[deep].any()

@@ -20,6 +20,7 @@ from overfly.errors import InputError
 from overfly.geodesy import Origin
 from overfly.geometry import Camera
 from overfly.mapping.blend import BLOCK, Canvas
+from overfly.mapping.fill import FILLED, SURE, fill
 from overfly.mapping.gains import balance
 from overfly.mapping.lattice import STEP, Chunk, Map, anchor, chunks, on_finer, placing
 from overfly.mapping.raster import Grid
@@ -28,15 +29,6 @@ from overfly.mapping.visibility import Image, View
 
 MARGIN = 6
 """Blocks computed around a window: one for filling, two each for the tone and for the votes, one for masks' filters."""
-
-FILL = 12
-"""A cell that no frame sees takes its neighbours' colour if a surely seen one is at most this many cells away."""
-
-FILLED = 254
-"""Alpha of such cells: opaque to the eye, and yet told from photographed ones (255) and from empty ones (0)."""
-
-SURE = 0.02
-"""Worth up to which a frame may well show the edge of what hides the cell instead of the cell."""
 
 HEM, SOFT = 9, 5
 """Kernels, in cells, by which a frame's mask shrinks from what is hidden from it, and is then smoothed."""
@@ -119,10 +111,10 @@ class Orthophoto:
             heights: [rows, columns] of ``surface``, NaN where empty.
 
         Returns:
-            RGB [rows, columns, 3] and alpha [rows, columns], both uint8: 255 where a photograph sees the cell,
-            :data:`FILLED` where none does and the colour is that of a neighbour on the same surface, at most
-            :data:`FILL` cells away; 0, and black, where the surface is empty, and where it is farther from all that is
-            seen: there no photograph tells the colour.
+            RGB [rows, columns, 3] and alpha [rows, columns], both uint8. Alpha is 255 where a photograph sees the cell;
+            :data:`overfly.mapping.fill.FILLED` where none does and the colour is that of seen cells of the same
+            surface, at most twice :data:`overfly.mapping.fill.FILL` cells away; 0, and the colour black, where the
+            surface is empty or where all that is seen is farther: there no photograph tells the colour.
         """
         wide, inner = _widened(grid)
         fine = on_finer(heights, surface, wide)
@@ -139,7 +131,7 @@ class Orthophoto:
                 stood = [w for w in steps if sight.touches(w.chunk, near)]
                 self._draw(i, wide.cell, fine, mine, sight.buffer(heights, surface.cell, around, stood), canvas)
         rgb, worth = canvas.blended()
-        filled = _fill(rgb, worth, fine, np.float32(STEP * surface.cell))
+        filled = fill(rgb, worth, fine, np.float32(STEP * surface.cell))
         alpha = np.where(worth > 0, 255, np.where(filled, FILLED, 0)).astype(np.uint8)
         return np.ascontiguousarray(np.moveaxis(rgb, 0, -1)[inner]), alpha[inner].copy()
 
@@ -226,41 +218,3 @@ def _feathered(free: NDArray[np.uint8]) -> Map:
     soft = cv2.blur(cv2.erode(padded, np.ones((HEM, HEM), np.uint8)), (SOFT, SOFT))
     factor = np.where(padded > 0, np.maximum(soft, int(255 * SURE)), 0) / np.float32(255)
     return np.asarray(factor[EDGE:-EDGE, EDGE:-EDGE])
-
-
-def _fill(rgb: NDArray[np.uint8], worth: Map, heights: Map, step: np.float32) -> NDArray[np.bool_]:
-    """Give cells of the surface that no frame sees the mean colour of their neighbours at like height.
-
-    Args:
-        rgb: [3, rows, columns], altered in place.
-        worth: [rows, columns], of the best frame; 0 where none sees the cell.
-        heights: [rows, columns], NaN where empty.
-        step: difference of heights between two surfaces.
-
-    Returns:
-        The cells that were given a colour [rows, columns].
-    """
-    import cv2
-
-    unseen = (worth == 0) & np.isfinite(heights)
-    near = cv2.dilate(unseen.astype(np.uint8), np.ones((2 * FILL + 1, 2 * FILL + 1), np.uint8)) > 0
-    # Sure colours must first find their way over the unsure ones, which are not altered.
-    unsure = near & (worth < SURE) & np.isfinite(heights)
-    unsure[[0, -1]] = unsure[:, [0, -1]] = False
-    source, known, z = rgb.copy().reshape(3, -1), ((worth > 0) & ~unsure).ravel(), heights.reshape(-1)
-    blank = np.flatnonzero(unsure)
-    for _ in range(FILL):
-        total, count = np.zeros((3, len(blank)), np.int64), np.zeros(len(blank), np.int64)
-        for beside in [down * heights.shape[1] + right for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]:
-            other = blank + beside
-            with np.errstate(invalid="ignore"):
-                good = known[other] & (np.abs(z[other] - z[blank]) <= step)
-            total[:, good] += source[:, other[good]]
-            count += good
-        found = count > 0
-        source[:, blank[found]] = (total[:, found] + count[found] // 2) // count[found]
-        known[blank[found]] = True
-        blank = blank[~found]
-    filled = unseen & known.reshape(unseen.shape)
-    np.copyto(rgb, source.reshape(rgb.shape), where=filled)
-    return filled
