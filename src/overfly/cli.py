@@ -137,6 +137,9 @@ def map_(
     ] = None,
     cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
     matcher: Annotated[str, typer.Option(help="Of key points: sift, encoder (of the network) or both.")] = "sift",
+    control: Annotated[
+        str, typer.Option(help="Points of gcp_list.txt: split (a quarter only checks), all, or none.")
+    ] = "split",
     dense: Annotated[str, typer.Option(help="sweep (network and stereo together) or stereo alone.")] = "sweep",
     size: Annotated[int, typer.Option(help="Longest side at which images are matched, pixels.")] = 1600,
     max_memory: Annotated[
@@ -163,6 +166,7 @@ def map_(
         network_name=network or "shipped",
         cameras=cameras,
         matcher=matcher,
+        control=control,
         dense=dense,
         size=size,
         max_memory_gb=max_memory,

@@ -1,52 +1,67 @@
-"""Cameras estimated from the images: verified matches, global mapping, bundle adjustment held by GPS."""
+"""Cameras estimated from the images: verified matches, sparse mapping, adjustment held by GPS and ground control."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
-from overfly.geometry import Array, Camera, pose
+from overfly.geometry import Array
+from overfly.mapping.adjustment import Adjusted, Held, adjusted, free
 from overfly.mapping.block import Block
+from overfly.mapping.bundle import Bundle, bundle_of
+from overfly.mapping.control import control_origin
+from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, strongest_pair
-from overfly.mapping.georeference import by_gps, by_ground, level_line, on_a_line
+from overfly.mapping.features import LONGEST_SIDE
+from overfly.mapping.georeference import by_ground
 from overfly.mapping.matches import Bar, matched
-from overfly.mapping.model import adjust, centres_and_rotations, mapped, moved
+from overfly.mapping.model import FEWEST_TO_CALIBRATE, mapped
+from overfly.mapping.placing import UNKNOWN_M, placed, widened
+from overfly.mapping.survey import Precision
 from overfly.networks.encoder import Encoder
 
-GPS_SIGMA_M = (0.5, 0.5)
-"""Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""
+NOISE_PX = 0.25
+"""Standard deviation of a key point, pixels of the picture that was searched: it weighs the images against GPS."""
 
-BAROMETER_SIGMA_M = 0.15
-"""The same of a height that the drone's barometer holds (frames with a relative altitude)."""
-
-FAR_OFF_M = 8.0
-"""A frame at least this far (and six times the median) off the common fit has a wrong GPS position."""
+WORST_PX = 3.0
+"""Rays that miss their point by more are dropped."""
 
 FOCAL_DRIFT = 0.1
+FOCAL_SIGMA = 0.02
+"""Standard deviation of a focal length by the photo's own data, as a share."""
 
 
 def align(
-    flight: Flight, *, workdir: Path, seed: int, bar: Bar, matcher: str = "sift", encoder: Encoder | None = None
+    flight: Flight,
+    *,
+    workdir: Path,
+    seed: int,
+    bar: Bar,
+    matcher: str = "sift",
+    encoder: Encoder | None = None,
+    control: str = "split",
 ) -> Block:
     """Estimate the cameras of a flight.
 
     Args:
         flight: frames with GPS and focal lengths where their files tell them; cameras they may have are not used.
-        workdir: features, matches and the sparse model are kept here, and reused.
+        workdir: features, matches and the sparse models are kept here, and reused.
         seed: of every random choice; the same seed gives the same cameras.
         bar: (step, unit) -> context manager of a function that takes (done, total).
         matcher: what finds the key points: "sift", "encoder" or "both".
         encoder: of a trained network; not needed by "sift".
+        control: what the flight's ground control points do: "split" keeps a quarter as check points, "all" puts all
+            of them into the adjustment, "none" leaves them aside.
 
     Returns:
-        The block of the registered frames: in local ENU metres where the images have GPS, else in a levelled frame
-        whose cameras stand 100 units above the ground and ``metric`` is False.
+        The block of the registered frames: in local ENU metres where GPS or three control points place it, else in a
+        levelled frame whose cameras stand 100 units above the ground and ``metric`` is False.
 
     Raises:
         InputError: fewer than two images could be placed.
@@ -67,21 +82,18 @@ def align(
             "keep the photos' EXIF, or give a calibrated camera."
         )
     with bar("cameras", "models") as update:
-        model = mapped(database, flight.root, workdir, total=len(flight), seed=seed)
+        names = [frame.name for frame in flight.frames]
+        models = mapped(database, flight.root, workdir, names=names, seed=seed)
         update(1, 2)
-        if model is None or model.num_reg_images() < 2:
+        if not models:
             raise InputError(
                 f"No two of the {len(flight)} images could be placed together (best pair: "
                 f"{strongest_pair(database)} common points, 15 needed): give sharp images that overlap by 30 % or more."
             )
-        ids = sorted(model.reg_image_ids())
-        index = {frame.name: i for i, frame in enumerate(flight.frames)}
-        order = [index[model.images[i].name] for i in ids]
-        registered = [flight.frames[i] for i in order]
-        model, metric = _placed(model, ids, registered, None if told is None else told[order], warnings, seed)
+        parts = [bundle_of(model, {name: i for i, name in enumerate(names)}) for model in models]
+        block = _held_block(flight, parts, origin, told, control, warnings, seed)
         update(2, 2)
-    _remark_focal(model, ids, registered, warnings)
-    return _block(model, ids, registered, order, origin if metric else None, metric, warnings)
+    return block
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
@@ -101,57 +113,93 @@ def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
     return origin, told
 
 
-def _placed(
-    model: Any, ids: list[int], frames: list[Frame], told: Array | None, warnings: list[str], seed: int
-) -> tuple[Any, bool]:
-    """The adjusted model in its final frame, and whether that is metric."""
-    gimbals = [frame.gimbal for frame in frames]
-    centres, rotations = centres_and_rotations(model, ids)
-    matrix = None
+def _held_block(
+    flight: Flight,
+    parts: list[Bundle],
+    origin: Origin | None,
+    told: Array | None,
+    control: str,
+    warnings: list[str],
+    seed: int,
+) -> Block:
+    """The adjusted block, by what there is: GPS and controls, either, or the ground alone."""
+    at = None
     if told is not None:
         try:
-            matrix = by_gps(centres, told, gimbals, rotations)
+            at = placed(parts, flight.frames, told, warnings)
         except InputError as error:
             warnings.append(f"{error} The map has no metric scale.")
-    if matrix is None or told is None:
-        model = adjust(model, ids, None, None, seed=seed)
-        centres, rotations = centres_and_rotations(model, ids)
-        points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
-        return moved(model, by_ground(centres, points, rotations, seed)), False
-    model = moved(model, matrix)
-    away = centres_and_rotations(model, ids)[0] - told
-    away[:, 2] = np.nan_to_num(away[:, 2])
-    distance = np.linalg.norm(away, axis=1)
-    wrong = distance > max(FAR_OFF_M, 6 * float(np.nanmedian(distance)))
-    if wrong.any():
-        names = ", ".join(frames[k].name for k in np.flatnonzero(wrong)[:5])
-        warnings.append(f"The GPS position of {int(wrong.sum())} images is far off and was not used: {names}.")
-    places, sigmas = np.where(wrong[:, None], np.nan, told), _sigmas(frames)
-    if np.isnan(places[:, 2]).all():
-        places[:, 2], sigmas[:, 2] = centres_and_rotations(model, ids)[0][:, 2], 1e3
-    model = adjust(model, ids, places, sigmas, seed=seed)
-    if on_a_line(told):
-        # GPS along a line holds the ends only: the block may have rolled about it.
-        centres, rotations = centres_and_rotations(model, ids)
-        model = moved(model, level_line(centres, gimbals, rotations))
-    return model, True
+    apart: list[str] = []
+    if at is not None:
+        result = adjusted_twice(at.bundle, replace(held_by_images(at.bundle, flight.frames), ups=at.ups,
+                                places=at.places, place_sigmas=at.sigmas, lever=True), flight.frames)  # fmt: skip
+        apart = [flight.frames[i].name for i in at.apart]
+        if apart:
+            warnings.append(
+                f"{len(apart)} images have too few points in common with the others and are held by GPS only "
+                f"({', '.join(apart[:5])}{' …' if len(apart) > 5 else ''}): between them and the rest the map may step "
+                "by the error of GPS."
+            )
+    else:
+        bundle = parts[0]
+        # A scale near metres: the unit of a sparse model is arbitrary.
+        result = adjusted_twice(bundle, held_by_images(bundle, flight.frames), flight.frames)
+    ruled: Controlled | None = None
+    if flight.gcps and control != "none":
+        if at is None and (origin := control_origin(flight.gcps)) is not None:
+            result = placed_by_controls(flight, result, origin, warnings)
+        if origin is not None:
+            ruled = controlled(flight, result, origin, with_gps=at is not None, how=control, warnings=warnings)
+            result = ruled.adjusted
+            if ruled.used and ruled.epsg is not None:
+                origin = replace(origin, epsg=ruled.epsg)
+    metric = at is not None or (ruled is not None and ruled.used)
+    if not metric:
+        origin = None
+        bundle = result.bundle
+        lift = by_ground(bundle.centres, bundle.points, bundle.world_from_camera, seed)
+        result = replace(result, bundle=bundle.moved(lift))
+    _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
+    return _block(result, flight.frames, origin, metric, ruled, apart, warnings)
 
 
-def _sigmas(frames: list[Frame]) -> Array:
-    """Standard deviations [n, 3] of the frames' GPS positions, metres."""
-    barometer = all(frame.relative_altitude is not None for frame in frames)
-    rows = []
-    for frame in frames:
-        stated = (frame.gps.horizontal_m, frame.gps.vertical_m) if frame.gps else (None, None)
-        flat = stated[0] or GPS_SIGMA_M[0]
-        rows.append([flat, flat, stated[1] or (BAROMETER_SIGMA_M if barometer else GPS_SIGMA_M[1])])
-    return np.array(rows)
+def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
+    """What the images and the photos' own data say of a bundle: the weights of its rays, priors of its cameras."""
+    own = [frames[i] for i in bundle.frames]
+    shrunk = np.array([max(1.0, max(frame.width, frame.height) / LONGEST_SIDE) for frame in own])
+    count = np.bincount(bundle.lens_of, minlength=len(bundle.lenses))
+    focals = [focal_px(own[int(np.flatnonzero(bundle.lens_of == j)[0])]) or np.nan for j in range(len(count))]
+    return replace(
+        free(bundle, NOISE_PX * shrunk[bundle.image]),
+        focals=np.array(focals, float),
+        focal_sigma=FOCAL_SIGMA,
+        lens_fixed=count < FEWEST_TO_CALIBRATE,
+    )
 
 
-def _remark_focal(model: Any, ids: list[int], frames: list[Frame], warnings: list[str]) -> None:
+def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjusted:
+    """Adjusted, then again without the rays that miss, and with GPS weighed by what it turned out to be worth."""
+    result = adjusted(bundle, held, tolerance=1.0)
+    shrunk = np.array([max(1.0, max(frames[i].width, frames[i].height) / LONGEST_SIDE) for i in bundle.frames])
+    good = result.bundle.errors() <= WORST_PX * shrunk[bundle.image]
+    kept = result.bundle.kept(good)
+    again = replace(
+        free(kept, NOISE_PX * shrunk[kept.image]),
+        places=held.places,
+        place_sigmas=widened(held.place_sigmas, result.away()),
+        ups=held.ups,
+        focals=held.focals,
+        focal_sigma=held.focal_sigma,
+        lens_fixed=held.lens_fixed,
+        lever=held.lever,
+    )
+    return adjusted(kept, again, lever=result.lever)
+
+
+def _remark_focal(bundle: Bundle, frames: list[Frame], warnings: list[str]) -> None:
     """Say where the images and the photo's own data disagree about the focal length."""
-    for i in {model.images[i].camera_id: i for i in ids}.values():
-        prior, found = focal_px(frames[ids.index(i)]), float(model.images[i].camera.params[0])
+    for j in range(len(bundle.lenses)):
+        prior, found = focal_px(frames[int(np.flatnonzero(bundle.lens_of == j)[0])]), float(bundle.lenses[j, 0])
         if prior and abs(found / prior - 1) > FOCAL_DRIFT:
             warnings.append(
                 f"The focal length came out as {found:.0f} px, the photos' data say {prior:.0f} px: heights may be "
@@ -160,27 +208,46 @@ def _remark_focal(model: Any, ids: list[int], frames: list[Frame], warnings: lis
 
 
 def _block(
-    model: Any,
-    ids: list[int],
-    frames: list[Frame],
-    order: list[int],
+    result: Adjusted,
+    frames: Sequence[Frame],
     origin: Origin | None,
     metric: bool,
+    ruled: Controlled | None,
+    apart: list[str],
     warnings: list[str],
 ) -> Block:
-    centres, rotations = centres_and_rotations(model, ids)
-    placed: dict[int, Frame] = {}
-    for i, number, frame, centre, rotation in zip(ids, order, frames, centres, rotations, strict=True):
-        f, cx, cy, k1, k2 = (float(v) for v in model.images[i].camera.params)
-        camera = Camera(frame.width, frame.height, f, f, cx, cy, k1=k1, k2=k2)
-        placed[number] = replace(frame, camera=camera, world_from_camera=pose(rotation, centre))
-    points = np.array([p.xyz for p in model.points3D.values() if p.error < 2]).reshape(-1, 3)
+    bundle, extra = result.bundle, 0 if ruled is None else ruled.added
+    known = [
+        replace(frames[i], camera=bundle.camera(k, frames[i].width, frames[i].height), world_from_camera=bundle.pose(k))
+        for k, i in enumerate(bundle.frames.tolist())
+    ]
+    tied = bundle.point < len(bundle.points) - extra
+    errors = bundle.errors()
+    mean = np.bincount(bundle.point, errors, minlength=len(bundle.points)) / np.maximum(
+        np.bincount(bundle.point, minlength=len(bundle.points)), 1
+    )
+    points = bundle.points[: len(bundle.points) - extra]
     return Block(
-        frames=[placed[number] for number in sorted(placed)],
+        frames=known,
         origin=origin,
         cameras_from="estimated",
         metric=metric,
-        reprojection_px=float(model.compute_mean_reprojection_error()),
-        points=points,
+        reprojection_px=float(errors[tied].mean()),
+        points=points[mean[: len(points)] < 2],
+        survey=None if ruled is None else ruled.survey,
+        precision=precision_of(result) if metric else Precision(why_not="no GPS and no control gives the block metres"),
+        links=[(i, j, count) for (i, j), count in bundle.links().items()],
+        held_by_gps=apart,
         warnings=warnings,
     )
+
+
+def precision_of(result: Adjusted) -> Precision:
+    """Standard deviations of the cameras, or why there are none."""
+    if (result.held.place_sigmas[:, 2] >= UNKNOWN_M).all() and not np.isfinite(result.held.knows).any():
+        return Precision(why_not="the heights of the cameras are unknown, so that nothing holds the block")
+    found = result.deviations()
+    if found is None:
+        return Precision(why_not="fewer than three positions hold the block")
+    positions, rotations, focals = found
+    return Precision(positions, np.rad2deg(rotations), float(focals[~result.held.lens_fixed].max(initial=0.0)) or None)

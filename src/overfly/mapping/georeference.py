@@ -10,6 +10,12 @@ from overfly.geometry import Array, fit_similarity, rotation_from_gimbal, transf
 COLLINEAR = 0.08
 """Below this ratio of the horizontal spreads, positions lie on a line and do not say which way is up."""
 
+LEAN_DEG, LEAN_GUESSED_DEG = 8.0, 20.0
+"""A block whose up is this far from that of the gimbals, or of the cameras' x axes, was tilted by wrong heights."""
+
+GROUP_M = 6.0
+"""Heights within this range agree with one another."""
+
 NOMINAL_HEIGHT = 100.0
 """Height of the cameras over the ground where the scale is unknown."""
 
@@ -33,7 +39,9 @@ def by_gps(positions: Array, told: Array, gimbals: list[tuple[float, float, floa
     if known.sum() < 2 or np.ptp(told[known, :2], axis=0).max() < 1.0:
         raise InputError("The GPS positions are too few or all at one place, so they cannot scale the map.")
     if known.sum() >= 4 and not on_a_line(told) and np.isfinite(told[known, 2]).all():
-        return _robust(positions[known], told[known])
+        matrix = _robust(positions[known], told[known])
+        if not _leans(matrix, gimbals, rotations):
+            return matrix  # else some heights are so wrong that they tilt the block
     level = np.eye(4)
     level[:3, :3] = _upright(gimbals, rotations)
     upright = transform(level, positions)
@@ -41,8 +49,33 @@ def by_gps(positions: Array, told: Array, gimbals: list[tuple[float, float, floa
     flat_to = np.column_stack([told[known, :2], np.zeros(known.sum())])
     matrix = _robust(flat_from, flat_to) @ level
     heights = told[:, 2] - transform(matrix, positions)[:, 2]
-    matrix[2, 3] += float(np.nanmedian(heights)) if np.isfinite(heights).any() else 0.0
+    matrix[2, 3] += _commonest(heights[np.isfinite(heights)])
     return matrix
+
+
+def _leans(matrix: Array, gimbals: list[tuple[float, float, float] | None], rotations: Array) -> bool:
+    """Whether the frame that ``matrix`` leads to contradicts the cameras' own up direction."""
+    if any(gimbal is not None for gimbal in gimbals):
+        up, most = _up(gimbals, rotations), LEAN_DEG
+    else:  # level cameras have their x axes in the horizontal plane
+        right = rotations[:, :, 0]
+        values, vectors = np.linalg.eigh(right.T @ right / len(right))
+        if values[1] < 0.05:
+            return False  # all fly in one direction: their x axes do not tell
+        up, most = vectors[:, 0], LEAN_GUESSED_DEG
+        up = up * np.sign(up @ -rotations[:, :, 2].mean(0))
+    up = matrix[:3, :3] @ up
+    return bool(up[2] / np.linalg.norm(up) < np.cos(np.deg2rad(most)))
+
+
+def _commonest(values: Array) -> float:
+    """The middle of the largest group within :data:`GROUP_M`; 0 without values."""
+    if not len(values):
+        return 0.0
+    ordered = np.sort(values)
+    ends = np.searchsorted(ordered, ordered + GROUP_M, side="right")
+    start = int((ends - np.arange(len(ordered))).argmax())
+    return float(np.median(ordered[start : ends[start]]))
 
 
 def on_a_line(told: Array) -> bool:

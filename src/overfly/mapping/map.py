@@ -96,7 +96,8 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
     """The block and the key of everything it depends on."""
     estimate = asked.cameras == "estimate" or (asked.cameras == "auto" and flight.cameras_from is None)
     steps.say("images", _about(flight))
-    matched = [asked.seed, *([] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)])]
+    ruled = [asked.control] if flight.gcps and asked.control != "split" else []
+    matched = [asked.seed, *ruled, *([] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)])]
     key = key_of(__version__, identity, estimate, matched if estimate else None)
     block = steps.kept(
         "cameras",
@@ -151,7 +152,16 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
 
     encoder = asked.network.network.encoder if asked.network is not None and asked.matcher != "sift" else None
     return checked(
-        align(flight, workdir=scratch, seed=asked.seed, bar=steps.bar, matcher=asked.matcher, encoder=encoder), flight
+        align(
+            flight,
+            workdir=scratch,
+            seed=asked.seed,
+            bar=steps.bar,
+            matcher=asked.matcher,
+            encoder=encoder,
+            control=asked.control,
+        ),
+        flight,
     )
 
 

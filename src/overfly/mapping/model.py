@@ -1,4 +1,4 @@
-"""The sparse model: global mapping of the matches, then bundle adjustment, held by GPS where there is any."""
+"""Sparse models by COLMAP: global mapping of the matches, incremental mapping of what it leaves."""
 
 from __future__ import annotations
 
@@ -8,53 +8,74 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from overfly.geometry import Array
-
 log = logging.getLogger("overfly")
 
 FEWEST_MATCHES = 15
 FEWEST_TO_CALIBRATE = 4
 """Frames that a camera needs before its focal length is estimated from them."""
 
-NOISE_PX = 0.25
-"""Standard deviation of a key point, pixels: it weighs the images against GPS."""
-
-WORST_PX = 3.0
+FEWEST_INLIERS = 10
+"""Common points that place a frame against a model that is there already: GPS and the adjustment check it."""
 
 THREADS = 1
 """Sums in the order of one thread: the same seed gives the same cameras to the last bit."""
 
 
-def mapped(database: Path, images: Path, workdir: Path, *, total: int, seed: int) -> Any:
-    """The model with most of the ``total`` frames, or None.
+def mapped(database: Path, images: Path, workdir: Path, *, names: Sequence[str], seed: int) -> list[Any]:
+    """Models without common frames, the largest first; empty where no two frames could be placed.
 
     Global mapping with tracks of three frames or more is tried first; at 30 % overlap most ground is seen twice only,
     so that frames left out ask for two-view tracks, and then for incremental mapping, which places them one by one.
+    What is still left is tried against the best model with few common points, then among itself.
     """
+    best = None
+    for views in (3, 2):
+        if views == 3 and len(names) < 3:
+            continue
+        best = _better(best, _global(database, images, _folder(workdir / f"global{views}"), names, views, seed))
+        if best is not None and best.num_reg_images() == len(names):
+            return [best]
+    best = _better(best, _incremental(database, images, _folder(workdir / "incremental"), names, seed))
+    if best is None:
+        return []
+    models, left = [best], _left(names, [best])
+    if left:
+        models = [_better(best, _extended(best, database, images, workdir, seed))]
+    while len(left := _left(names, models)) >= 2:
+        more = _incremental(database, images, _folder(workdir / f"part{len(models)}"), left, seed)
+        part = _better(None, more)
+        if part is None or part.num_reg_images() < 2:
+            break
+        models.append(part)
+    return models
+
+
+def _left(names: Sequence[str], models: Sequence[Any]) -> list[str]:
+    placed = {model.images[i].name for model in models for i in model.reg_image_ids()}
+    return [name for name in names if name not in placed]
+
+
+def _global(database: Path, images: Path, folder: Path, names: Sequence[str], views: int, seed: int) -> dict[int, Any]:
     import pycolmap
 
-    best: Any = None
-    for views in (3, 2):
-        if views == 3 and total < 3:
-            continue
-        options = pycolmap.GlobalPipelineOptions()
-        options.random_seed = seed
-        options.num_threads = THREADS
-        options.mapper.bundle_adjustment.ceres.solver_options.num_threads = THREADS
-        options.min_model_size = 2
-        options.mapper.track_min_num_views_per_track = views
-        options.mapper.global_positioning.min_num_view_per_track = views
-        options.mapper.bundle_adjustment.min_track_length = 2
-        options.mapper.retriangulation.ignore_two_view_tracks = False
-        if total < FEWEST_TO_CALIBRATE:
-            options.mapper.bundle_adjustment.refine_focal_length = False
-            options.mapper.bundle_adjustment.refine_extra_params = False
-        folder = _folder(workdir / f"global{views}")
-        best = _better(best, _attempt(partial(pycolmap.global_mapping, database, images, folder, options)))
-        if best is not None and best.num_reg_images() == total:
-            return best
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = seed
+    options.num_threads = THREADS
+    options.mapper.bundle_adjustment.ceres.solver_options.num_threads = THREADS
+    options.min_model_size = 2
+    options.mapper.track_min_num_views_per_track = views
+    options.mapper.global_positioning.min_num_view_per_track = views
+    options.mapper.bundle_adjustment.min_track_length = 2
+    options.mapper.retriangulation.ignore_two_view_tracks = False
+    if len(names) < FEWEST_TO_CALIBRATE:
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_extra_params = False
+    return _attempt(partial(pycolmap.global_mapping, database, images, folder, options))
+
+
+def _pipeline(names: Sequence[str], seed: int) -> Any:
+    import pycolmap
+
     pipeline = pycolmap.IncrementalPipelineOptions()
     pipeline.random_seed = seed
     pipeline.num_threads = THREADS
@@ -62,13 +83,37 @@ def mapped(database: Path, images: Path, workdir: Path, *, total: int, seed: int
     pipeline.min_num_matches = FEWEST_MATCHES
     pipeline.extract_colors = False
     pipeline.triangulation.ignore_two_view_tracks = False
-    if total < FEWEST_TO_CALIBRATE:
+    pipeline.image_names = list(names)
+    if len(names) < FEWEST_TO_CALIBRATE:
         pipeline.ba_refine_focal_length = False
         pipeline.ba_refine_extra_params = False
         pipeline.mapper.init_min_num_inliers = 30
         pipeline.mapper.init_min_tri_angle = 4
-    folder = _folder(workdir / "incremental")
-    return _better(best, _attempt(partial(pycolmap.incremental_mapping, database, images, folder, pipeline)))
+    return pipeline
+
+
+def _incremental(database: Path, images: Path, folder: Path, names: Sequence[str], seed: int) -> dict[int, Any]:
+    import pycolmap
+
+    return _attempt(partial(pycolmap.incremental_mapping, database, images, folder, _pipeline(names, seed)))
+
+
+def _extended(model: Any, database: Path, images: Path, workdir: Path, seed: int) -> dict[int, Any]:
+    """The model with frames that share a few points only; what it has stays as it is."""
+    import pycolmap
+
+    pipeline = _pipeline([], seed)
+    pipeline.multiple_models = False
+    pipeline.fix_existing_frames = True
+    pipeline.constant_cameras = set(model.cameras)
+    pipeline.mapper.abs_pose_min_num_inliers = FEWEST_INLIERS
+    pipeline.mapper.abs_pose_refine_focal_length = False
+    pipeline.mapper.abs_pose_refine_extra_params = False
+    start = _folder(workdir / "placed")
+    model.write(start)
+    folder = _folder(workdir / "extended")
+    run = partial(pycolmap.incremental_mapping, database, images, folder, pipeline, input_path=start)
+    return _attempt(run)
 
 
 def _attempt(run: Callable[[], dict[int, Any]]) -> dict[int, Any]:
@@ -88,77 +133,3 @@ def _better(best: Any, models: dict[int, Any]) -> Any:
 def _folder(path: Path) -> Path:
     path.mkdir(parents=True, exist_ok=True)
     return path
-
-
-def adjust(model: Any, ids: Sequence[int], places: Array | None, sigmas: Array | None, *, seed: int) -> Any:
-    """Bundle adjustment with a robust loss; returns a new model.
-
-    Args:
-        model: in metres near ``places`` where these are given.
-        ids: its registered images.
-        places: GPS positions [n, 3], NaN rows are free; None leaves the frame as it is.
-        sigmas: their standard deviations [n, 3], metres. They keep nadir blocks from bowing: images alone hardly tell
-            focal length and lens from a curved ground.
-        seed: of the robust alignment.
-    """
-    import pycolmap
-
-    refined = pycolmap.Reconstruction(model)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = 2 * NOISE_PX
-    options.ceres.solver_options.num_threads = THREADS
-    options.ceres.solver_options.max_num_iterations = 150
-    options.ceres.solver_options.function_tolerance = 1e-7
-    config = pycolmap.BundleAdjustmentConfig()
-    shots: dict[int, int] = {}
-    for i in ids:
-        config.add_image(i)
-        camera = refined.images[i].camera_id
-        shots[camera] = shots.get(camera, 0) + 1
-    for camera, count in shots.items():
-        if count < FEWEST_TO_CALIBRATE:
-            config.set_constant_cam_intrinsics(camera)
-    known = [] if places is None else np.flatnonzero(np.isfinite(places).all(1)).tolist()
-    if places is None or sigmas is None or len(known) < 3:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        pycolmap.create_default_bundle_adjuster(options, config, refined).solve()
-    else:
-        priors = [_prior(refined.images[ids[k]], places[k], sigmas[k] / NOISE_PX) for k in known]
-        held = pycolmap.PosePriorBundleAdjustmentOptions()
-        held.alignment_ransac.random_seed = seed
-        held.alignment_ransac.max_error = 10.0
-        held.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.HUBER
-        pycolmap.create_pose_prior_bundle_adjuster(options, held, config, priors, refined).solve()
-    refined.update_point_3d_errors()
-    for point in [p for p, value in refined.points3D.items() if value.error > WORST_PX]:
-        refined.delete_point3D(point)
-    return refined
-
-
-def _prior(image: Any, place: Array, sigma: Array) -> Any:
-    import pycolmap
-
-    prior = pycolmap.PosePrior()
-    prior.corr_data_id = image.data_id
-    prior.position = place
-    prior.position_covariance = np.diag(np.square(sigma))
-    prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
-    return prior
-
-
-def centres_and_rotations(model: Any, ids: Sequence[int]) -> tuple[Array, Array]:
-    """Camera centres [n, 3] and model-from-camera rotations [n, 3, 3]."""
-    centres = np.array([model.images[i].projection_center() for i in ids])
-    return centres, np.stack([model.images[i].cam_from_world().rotation.matrix().T for i in ids])
-
-
-def moved(model: Any, matrix: Array) -> Any:
-    """The model in another frame: ``matrix`` is a similarity [4, 4]; a new model."""
-    import pycolmap
-
-    result = pycolmap.Reconstruction(model)
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    result.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(matrix[:3, :3] / scale), matrix[:3, 3]))
-    return result

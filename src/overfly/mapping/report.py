@@ -149,7 +149,7 @@ def _tiles(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
 
 
 def _accuracy(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
-    rows: list[tuple[str, str, str]] = []
+    rows = _surveyed(summary)
     if (pixels := summary.get("reprojection_px")) is not None:
         rows.append(
             ("Reprojection error", f"{pixels:.2f} px", "below 1 px is good; above 1.5 px look for blurred images")
@@ -179,11 +179,13 @@ def _accuracy(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
     )
     if summary["metric"]:
         estimated = summary["cameras_from"] == "estimated"
-        how = "from the GPS of the images" if estimated else f"as given by {summary['cameras_from']}"
+        ruled = bool((summary.get("ground_control") or {}).get("controls"))
+        how = "from ground control" if ruled else "from the GPS of the images"
+        how = how if estimated else f"as given by {summary['cameras_from']}"
         rows.append(("Metric scale", "known", how))
     else:
         rows.append(("Metric scale", "unknown", "no GPS, no origin: measure a known distance and scale by it"))
-    if summary["crs"]:
+    if summary["crs"] and not (summary.get("ground_control") or {}).get("controls"):
         rows.append(
             (
                 "Absolute height",
@@ -192,6 +194,44 @@ def _accuracy(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
             )
         )
     return [{"label": label, "value": value, "note": note} for label, value, note in rows]
+
+
+def _surveyed(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Check points first, then what held the map, then the cameras' precision."""
+    rows: list[tuple[str, str, str]] = []
+    ground = summary.get("ground_control") or {}
+    notes = {
+        "checks": "never used in the adjustment: the accuracy of the map where it is controlled",
+        "controls": "they hold the map, so that they flatter it; weighed by their own spread",
+    }
+    for kind, label in (("checks", "Check points"), ("controls", "Control points")):
+        if rms := ground.get(kind):
+            value = f"{rms['x_m']:.3f} / {rms['y_m']:.3f} / {rms['z_m']:.3f} m"
+            rows.append((f"{label} ({rms['points']}), RMS east / north / up", value, notes[kind]))
+    if ground and not ground.get("checks"):
+        rows.append(("Check points", "none", "nothing checks the map: give four control points or more"))
+    for point in ground.get("points", ()):
+        if point["residual"] is not None:
+            value = " / ".join(f"{v:+.3f}" for v in point["residual"]) + " m"
+            rows.append(
+                (f"{point['name']} ({point['role']})", value, f"{point['pixels']:.1f} px in {point['images']} images")
+            )
+    if shift := ground.get("gps_shift_m"):
+        value = " / ".join(f"{v:+.2f}" for v in shift) + " m"
+        rows.append(("GPS against ground control, east / north / up", value, "the map follows the controls"))
+    precision = summary.get("precision") or {}
+    if "horizontal_m" in precision:
+        h, v, r = (precision[k] for k in ("horizontal_m", "vertical_m", "rotation_deg"))
+        rows.append(
+            (
+                "Camera positions, standard deviation (median, worst)",
+                f"{h['median']:.3f} m ({h['worst']:.3f}), up {v['median']:.3f} m ({v['worst']:.3f})",
+                f"from the adjustment; directions {r['median']:.3f}° ({r['worst']:.3f}°)",
+            )
+        )
+    elif why := precision.get("why_not"):
+        rows.append(("Camera positions, standard deviation", "unknown", why))
+    return rows
 
 
 def _missing(summary: Mapping[str, Any]) -> list[dict[str, str]]:

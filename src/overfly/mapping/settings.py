@@ -7,6 +7,7 @@ from typing import Any
 
 from overfly.errors import InputError, unknown
 from overfly.mapping.matches import MATCHERS
+from overfly.mapping.survey import CONTROL
 from overfly.mapping.sweep import TrainedRun
 
 CAMERAS = ("auto", "given", "estimate")
@@ -23,6 +24,8 @@ class MapSettings:
     Attributes:
         cameras: "given" takes those of the flight folder, "estimate" ignores them, "auto" takes them if there are any.
         matcher: what finds the key points from which cameras are estimated: "sift", the network's "encoder", or "both".
+        control: what ground control points do: "split" keeps a quarter of four or more to check the map, "all" lets all
+            hold it, "none" leaves them aside.
         dense: "sweep" by a trained network, "stereo" by semi-global matching of rectified pairs.
         network: the trained run (``overfly.run.load_run``); needed by "sweep" and by the matcher
             "encoder", unused by "stereo" and "sift".
@@ -38,6 +41,7 @@ class MapSettings:
 
     cameras: str = "auto"
     matcher: str = "sift"
+    control: str = "split"
     dense: str = "sweep"
     network: TrainedRun | None = None
     network_name: str | None = None
@@ -54,6 +58,8 @@ class MapSettings:
             raise unknown("--cameras", self.cameras, CAMERAS)
         if self.matcher not in MATCHERS:
             raise unknown("--matcher", self.matcher, MATCHERS)
+        if self.control not in CONTROL:
+            raise unknown("--control", self.control, CONTROL)
         if self.dense not in DENSE:
             raise unknown("--dense", self.dense, DENSE)
         if self.dense == "sweep" and self.network is None:
@@ -79,6 +85,7 @@ class MapSettings:
             "cameras": self.cameras,
             "dense": self.dense,
             "matcher": self.matcher,
+            "control": self.control,
             "network": self.network_name if self.dense == "sweep" or self.matcher != "sift" else None,
             "max_memory_gb": self.max_memory_gb,
             "size": self.size,

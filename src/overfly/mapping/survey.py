@@ -10,7 +10,8 @@ import numpy as np
 
 from overfly.geometry import Array
 
-ROLES = ("control", "check", "unused")
+CONTROL = ("split", "all", "none")
+"""What ground control points may do."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class Survey:
         chosen = [p for p in self.points if p.role == role and p.residual is not None]
         if not chosen:
             return None
-        away = np.sqrt(np.mean(np.square([p.residual for p in chosen]), axis=0))
+        residuals = np.array([p.residual for p in chosen], float)
+        away = np.sqrt((residuals**2).mean(0))
         pixels = float(np.sqrt(np.mean([p.pixels**2 for p in chosen if p.pixels is not None])))
         return {
             "points": len(chosen),
@@ -124,5 +126,5 @@ def precision_from(content: dict[str, Any] | None) -> Precision | None:
     """What :meth:`Precision.to_json` made."""
     if content is None:
         return None
-    arrays = [None if content[n] is None else np.array(content[n]) for n in ("position_m", "rotation_deg")]
-    return Precision(*arrays, content["focal"], content["why_not"])
+    position, rotation = (None if content[n] is None else np.array(content[n]) for n in ("position_m", "rotation_deg"))
+    return Precision(position, rotation, content["focal"], content["why_not"])

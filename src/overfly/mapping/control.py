@@ -1,0 +1,291 @@
+"""Ground control points: which are usable, where the block sees them, and what holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.errors import InputError
+from overfly.flights import ControlPoint, Flight
+from overfly.geodesy import Origin, enu_from_geodetic
+from overfly.geometry import Array, fit_similarity, rays, transform
+from overfly.mapping.bundle import Bundle
+
+FEWEST = 3
+FEWEST_TO_CHECK = 4
+CHECK_SHARE = 0.25
+
+CLICK_PX = 1.0
+"""Standard deviation of a pixel that a person clicked, for images up to :data:`CLICK_SIDE` pixels wide."""
+
+CLICK_SIDE = 1600
+FAR_CLICK = 6.0
+"""A click this many standard deviations off where the other images see the point is wrong."""
+
+FAR_OFF_M = 8.0
+"""A point at least this far from the common shift against GPS is wrong."""
+
+MOST_TRIPLES = 1500
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """A ground control point: surveyed place [3] in the block's frame, clicks (image of the bundle, pixel)."""
+
+    name: str
+    place: Array
+    clicks: tuple[tuple[int, tuple[float, float]], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A control as the block sees it: triangulated position [3], mean distance from the clicks, the clicks used."""
+
+    point: Array
+    pixels: float
+    clicks: tuple[tuple[int, tuple[float, float]], ...]
+
+
+def control_origin(points: Sequence[ControlPoint]) -> Origin | None:
+    """An origin in the middle of the controls, in their own CRS; None if there are less than three."""
+    if len(points) < FEWEST:
+        return None
+    geodetic = np.array([_geodetic(point) for point in points])
+    latitude, longitude, height = (float(v) for v in np.median(geodetic, axis=0))
+    return Origin(latitude, longitude, height, projected_epsg(points[0].crs))
+
+
+def projected_epsg(crs: str) -> int | None:
+    """EPSG code of a projected CRS in metres, None for any other."""
+    from pyproj import CRS
+
+    from overfly.flights.odm import crs_name
+
+    found = CRS.from_user_input(crs_name(crs))
+    metres = found.is_projected and all(axis.unit_name == "metre" for axis in found.axis_info[:2])
+    return found.to_epsg() if metres else None
+
+
+def _geodetic(point: ControlPoint) -> tuple[float, float, float]:
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    from overfly.flights.odm import crs_name
+
+    x, y, z = point.position
+    try:
+        longitude, latitude = Transformer.from_crs(crs_name(point.crs), "EPSG:4326", always_xy=True).transform(
+            x, y, errcheck=True
+        )
+    except ProjError as error:
+        raise InputError(
+            f"The first line of gcp_list.txt must be a CRS that fits the coordinates, such as EPSG:32617, not "
+            f"{point.crs!r} ({str(error).splitlines()[0]})."
+        ) from error
+    return latitude, longitude, z
+
+
+def read_controls(flight: Flight, bundle: Bundle, origin: Origin, warnings: list[str]) -> list[Control]:
+    """The flight's control points with their clicks in the bundle's images; heights are taken as the file has them.
+
+    Clicks outside of their image or in images that the flight does not have are left out, with one warning each kind.
+    """
+    by_name = {frame.name: i for i, frame in enumerate(flight.frames)}
+    by_base = {name.rsplit("/", 1)[-1].lower(): i for name, i in by_name.items()}
+    image_of = {int(frame): k for k, frame in enumerate(bundle.frames)}
+    absent, outside, found = set(), set(), []
+    for point in flight.gcps:
+        clicks = []
+        for name, (u, v) in point.pixels.items():
+            number = by_name.get(name, by_base.get(name.rsplit("/", 1)[-1].lower()))
+            if number is None:
+                absent.add(name)
+                continue
+            frame = flight.frames[number]
+            if not (0 <= u <= frame.width and 0 <= v <= frame.height):
+                outside.add(f"{point.name} in {name}")
+            elif number in image_of:
+                clicks.append((image_of[number], (u, v)))
+        found.append(Control(point.name, enu_from_geodetic([_geodetic(point)], origin)[0], tuple(sorted(clicks))))
+    if absent:
+        warnings.append(
+            f"gcp_list.txt names {len(absent)} images that the flight does not have ({_listed(absent)}): these lines "
+            "were not used."
+        )
+    if outside:
+        warnings.append(
+            f"gcp_list.txt gives pixels outside of the image for {_listed(outside)}: these were not used; it must hold "
+            "column and row in the images as they are stored."
+        )
+    return found
+
+
+def see(bundle: Bundle, control: Control, sizes: Sequence[tuple[int, int]], warnings: list[str]) -> Seen | None:
+    """Triangulate a control from its clicks; clicks that contradict the others are left out, with a warning.
+
+    Args:
+        bundle: the cameras.
+        control: with its clicks.
+        sizes: width and height of the bundle's images.
+        warnings: for the user.
+
+    Returns:
+        None if less than two consistent clicks are left.
+    """
+    clicks = control.clicks
+    while len(clicks) >= 2:
+        point = triangulated(bundle, clicks, sizes)
+        image = np.array([k for k, _ in clicks])
+        away = bundle.project(np.repeat(point[None], len(clicks), axis=0), image) - [pixel for _, pixel in clicks]
+        distance = np.nan_to_num(np.linalg.norm(away, axis=1), nan=np.inf)
+        relative = distance / [click_sigma(sizes[k]) for k, _ in clicks]
+        worst = int(relative.argmax())
+        if relative[worst] <= FAR_CLICK:
+            return Seen(point, float(distance.mean()), clicks)
+        if len(clicks) == 2:
+            warnings.append(
+                f"The two clicks of {control.name} miss each other by {distance.sum():.0f} px, so it was not used: "
+                "check its pixels in gcp_list.txt."
+            )
+            return None
+        warnings.append(
+            f"One click of {control.name} lies {distance[worst]:.0f} px from where the other images see it and was not "
+            "used: check its pixels in gcp_list.txt."
+        )
+        clicks = tuple(click for k, click in enumerate(clicks) if k != worst)
+    return None
+
+
+def click_sigma(size: tuple[int, int]) -> float:
+    """Standard deviation of a click in an image of this size, pixels."""
+    return CLICK_PX * max(1.0, max(size) / CLICK_SIDE)
+
+
+def triangulated(
+    bundle: Bundle, clicks: Sequence[tuple[int, tuple[float, float]]], sizes: Sequence[tuple[int, int]]
+) -> Array:
+    """The point [3] nearest to the clicks' rays, then with the least robust distance in the images."""
+    from scipy.optimize import least_squares
+
+    square, right = np.zeros((3, 3)), np.zeros(3)
+    for k, pixel in clicks:
+        ray = bundle.rotations[k].T @ rays(np.array([pixel]), bundle.camera(k, *sizes[k]))[0]
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        square, right = square + across, right + across @ bundle.centres[k]
+    start = np.linalg.lstsq(square, right, rcond=None)[0]
+    image = np.array([k for k, _ in clicks])
+    pixels = np.array([pixel for _, pixel in clicks])
+    scale = np.array([click_sigma(sizes[k]) for k, _ in clicks])[:, None]
+
+    def away(point: Array) -> Array:
+        off = bundle.project(np.repeat(point[None], len(image), axis=0), image) - pixels
+        return np.asarray((np.nan_to_num(off, nan=1e4) / scale).ravel())
+
+    return np.asarray(least_squares(away, start, loss="cauchy" if len(clicks) > 2 else "linear", x_scale="jac").x)
+
+
+def consistent(source: Array, target: Array, *, metric: bool) -> NDArray[np.bool_]:
+    """Which controls [n] fit together.
+
+    Args:
+        source: triangulated [n, 3].
+        target: surveyed [n, 3].
+        metric: whether the source is in metres, level and oriented, so that a shift must nearly do.
+
+    A least trimmed squares fit over triples (Rousseeuw & Leroy, "Robust regression", 1987) shows one wrong point in
+    five or more; of fewer a contradiction cannot be told apart.
+    """
+    good = np.ones(len(source), bool)
+    if metric and len(source) >= 2:
+        away = target - source
+        distance = np.linalg.norm(away - np.median(away, axis=0), axis=1)
+        good = distance <= max(FAR_OFF_M, 6 * float(np.median(distance)))
+    n = int(good.sum())
+    if n < 5:
+        return good
+    rows = np.flatnonzero(good)
+    triples = list(combinations(range(n), 3))
+    triples = triples[:: max(1, len(triples) // MOST_TRIPLES)]
+    most = n - max(1, n // 4)
+    least, inside = np.inf, np.zeros(0, np.intp)
+    for triple in triples:
+        three = rows[list(triple)]
+        if flat(target[three]):
+            continue
+        matrix = fit_similarity(source[three], target[three])
+        distance = np.linalg.norm(transform(matrix, source[rows]) - target[rows], axis=1)
+        nearest = np.argsort(distance, kind="stable")[:most]
+        if (total := float((distance[nearest] ** 2).sum())) < least:
+            least, inside = total, rows[nearest]
+    if not len(inside):
+        return good
+    matrix = fit_similarity(source[inside], target[inside])
+    distance = np.linalg.norm(transform(matrix, source) - target, axis=1)
+    spread = float(np.sqrt((distance[inside] ** 2).sum() / (3 * most - 7)))
+    return np.asarray(good & (distance <= max(3 * (1 + 5 / (n - 3)) * spread, 0.1)))
+
+
+def flat(places: Array) -> bool:
+    """Whether points [n, 3] lie on a line, so that they leave a rotation open."""
+    spread = np.linalg.svd(places - places.mean(0), compute_uv=False)
+    return bool(len(places) < 3 or spread[1] < 0.05 * spread[0])
+
+
+def spread_m(source: Array, target: Array, *, scaled: bool) -> Array:
+    """Standard deviation [2] of controls, horizontal and vertical, metres: what a similarity (else a shift) leaves."""
+    away = transform(fit_similarity(source, target, rotate=scaled, scale=scaled), source) - target
+    share = np.sqrt(3 * len(source) / max(3 * len(source) - (7 if scaled else 3), 1))
+    return np.array([np.sqrt((away[:, :2] ** 2).mean()), np.sqrt((away[:, 2] ** 2).mean())]) * share
+
+
+def checks_of(places: Array) -> NDArray[np.bool_]:
+    """Which of the surveyed points [n, 3] are kept as check points; deterministic.
+
+    Three points that span the area hold the block; of the others the quarter that is farthest from these and from one
+    another checks it, so that the checks do not flatter.
+    """
+    n = len(places)
+    check = np.zeros(n, bool)
+    if n < FEWEST_TO_CHECK:
+        return check
+    plan = places[:, :2]
+    held = [int(np.linalg.norm(plan - plan.mean(0), axis=1).argmax())]
+    while len(held) < FEWEST:
+        distance = np.linalg.norm(plan[:, None] - plan[held], axis=2).min(1)
+        if len(held) == 2:  # the third spans a triangle
+            along = plan[held[1]] - plan[held[0]]
+            distance = np.abs((plan - plan[held[0]]) @ [along[1], -along[0]])
+        held.append(int(distance.argmax()))
+    taken = list(held)
+    for _ in range(max(1, round(CHECK_SHARE * n))):
+        distance = np.linalg.norm(plan[:, None] - plan[taken], axis=2).min(1)
+        distance[taken] = -1
+        chosen = int(distance.argmax())
+        check[chosen] = True
+        taken.append(chosen)
+    return check
+
+
+def with_controls(bundle: Bundle, seen: Sequence[Seen]) -> Bundle:
+    """The bundle with the controls as its last points, at where it sees them."""
+    first = len(bundle.points)
+    image = [k for control in seen for k, _ in control.clicks]
+    point = [first + i for i, control in enumerate(seen) for _ in control.clicks]
+    pixels = np.array([pixel for control in seen for _, pixel in control.clicks], float).reshape(-1, 2)
+    return replace(
+        bundle,
+        points=np.concatenate([bundle.points, np.array([control.point for control in seen]).reshape(-1, 3)]),
+        image=np.concatenate([bundle.image, np.array(image, np.intp)]),
+        point=np.concatenate([bundle.point, np.array(point, np.intp)]),
+        pixels=np.concatenate([bundle.pixels, pixels]),
+    )
+
+
+def _listed(names: set[str]) -> str:
+    some = sorted(names)[:4]
+    return ", ".join(some) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

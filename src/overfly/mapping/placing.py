@@ -1,0 +1,167 @@
+"""Bundles brought to metres by the images' own GPS, each by itself, then together; and GPS that is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.errors import InputError
+from overfly.flights import Frame
+from overfly.geometry import Array, rotation_from_gimbal
+from overfly.mapping.bundle import Bundle, merged
+from overfly.mapping.georeference import by_gps, level_line, on_a_line
+
+GPS_SIGMA_M = (0.5, 0.5)
+"""Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""
+
+BAROMETER_SIGMA_M = 0.15
+"""The same of a height that the drone's barometer holds (frames with a relative altitude)."""
+
+FAR_OFF_M = 8.0
+"""A position or height at least this far (and six times the median) off the common fit is wrong."""
+
+UNKNOWN_M = 1e3
+"""Standard deviation of a height of which nothing is known."""
+
+FEWEST_OF_A_PART = 2
+"""Frames with GPS that place a part of the flight that has no common points with the rest."""
+
+MIRRORED = -0.6
+"""Correlation of heights by GPS and by the images below which the sign of the altitude is wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Bundles in one metric frame.
+
+    Attributes:
+        bundle: all parts.
+        places: GPS positions [n, 3], NaN where unknown or wrong.
+        sigmas: their standard deviations [n, 3], metres.
+        ups: the vertical in camera axes [n, 3] of images that GPS does not level; NaN for the others.
+        apart: frames that no common points but GPS alone connects to the largest part.
+    """
+
+    bundle: Bundle
+    places: Array
+    sigmas: Array
+    ups: Array
+    apart: NDArray[np.intp]
+
+
+def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnings: list[str]) -> Placed:
+    """Bring each part to its GPS positions by its own similarity; parts that have too few are left out.
+
+    Args:
+        parts: the largest first.
+        frames: of the flight.
+        told: their GPS positions [n, 3] in local ENU metres, NaN where unknown.
+        warnings: for the user.
+
+    Raises:
+        InputError: GPS does not scale the largest part.
+    """
+    done: list[tuple[Bundle, Array, Array, Array]] = []
+    for number, part in enumerate(parts):
+        own = [frames[i] for i in part.frames]
+        gimbals, places = [frame.gimbal for frame in own], told[part.frames]
+        if number and np.isfinite(places[:, :2]).all(1).sum() < FEWEST_OF_A_PART:
+            continue
+        try:
+            part = part.moved(by_gps(part.centres, places, gimbals, part.world_from_camera))
+        except InputError:
+            if number == 0:
+                raise
+            continue
+        places = without_faults(part, places, own, warnings)
+        ups = np.full((len(part), 3), np.nan)
+        if on_a_line(places) or np.isnan(places[:, 2]).all():
+            # GPS along a line holds the ends only: the block may have rolled about it.
+            if on_a_line(places):
+                part = part.moved(level_line(part.centres, gimbals, part.world_from_camera))
+            ups = _ups(part, gimbals)
+        sigmas = gps_sigmas(own)
+        if np.isnan(places[:, 2]).all():  # the heights stay as they are, so that the equations are regular
+            places[:, 2] = np.where(np.isfinite(places[:, 0]), part.centres[:, 2], np.nan)
+            sigmas[:, 2] = UNKNOWN_M
+        done.append((part, places, sigmas, ups))
+    numbers = np.concatenate([part.frames for part, *_ in done])
+    order = np.argsort(numbers, kind="stable")
+    bundle = merged([part for part, *_ in done])
+    places, sigmas, ups = (np.concatenate([parts[i] for parts in done])[order] for i in (1, 2, 3))
+    return Placed(bundle, places, sigmas, ups, apart=np.sort(numbers[len(done[0][0]) :]))
+
+
+def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warnings: list[str]) -> Array:
+    """GPS positions [n, 3] with what is wrong taken out: single positions, single heights, heights of wrong sign."""
+    places = places.copy()
+    away = bundle.centres - places
+    flat = np.linalg.norm(away[:, :2], axis=1)
+    wrong = flat > max(FAR_OFF_M, 6 * float(np.nanmedian(flat)))
+    if wrong.any():
+        warnings.append(f"The GPS position of {_some(wrong, frames)} is far off and was not used.")
+    places[wrong] = np.nan
+    rise = np.where(wrong, np.nan, away[:, 2])
+    if np.isfinite(rise).sum() >= 4:
+        known = np.isfinite(rise)
+        told, seen = places[known, 2], bundle.centres[known, 2]
+        # A tilt of the frame must not hide it: heights are compared without their planes.
+        plan = np.column_stack([bundle.centres[known, :2], np.ones(known.sum())])
+        told, seen = (z - plan @ np.linalg.lstsq(plan, z, rcond=None)[0] for z in (told, seen))
+        if known.sum() >= 8 and min(told.std(), seen.std()) > 1.0 and np.corrcoef(told, seen)[0, 1] < MIRRORED:
+            warnings.append(
+                "The altitudes fall where the images show that the cameras rise: their sign is wrong, and they were "
+                "not used."
+            )
+            places[:, 2] = np.nan
+            return places
+    size = np.abs(rise)
+    high = (
+        size > max(FAR_OFF_M, 6 * float(np.nanmedian(size))) if np.isfinite(size).any() else np.zeros(len(size), bool)
+    )
+    if high.any():
+        typical = float(np.median(rise[high]))
+        warnings.append(
+            f"The altitude of {_some(high, frames)} disagrees with the others by about {abs(typical):.0f} m and was "
+            "not used: look for frames that tell it above another level."
+        )
+    places[high, 2] = np.nan
+    return places
+
+
+def _some(chosen: NDArray[np.bool_], frames: Sequence[Frame]) -> str:
+    names = [frames[k].name for k in np.flatnonzero(chosen).tolist()]
+    return f"{len(names)} images ({', '.join(names[:5])}{' …' if len(names) > 5 else ''})"
+
+
+def _ups(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
+    """The vertical in camera axes [n, 3], by the gimbal where there is one, else as the levelled bundle has it."""
+    ups = bundle.rotations[:, :, 2].copy()
+    for k, gimbal in enumerate(gimbals):
+        if gimbal is not None:
+            ups[k] = rotation_from_gimbal(*gimbal)[2]
+    return ups
+
+
+def gps_sigmas(frames: Sequence[Frame]) -> Array:
+    """Standard deviations [n, 3] of the frames' GPS positions, metres."""
+    barometer = all(frame.relative_altitude is not None for frame in frames)
+    rows = []
+    for frame in frames:
+        stated = (frame.gps.horizontal_m, frame.gps.vertical_m) if frame.gps else (None, None)
+        flat = stated[0] or GPS_SIGMA_M[0]
+        rows.append([flat, flat, stated[1] or (BAROMETER_SIGMA_M if barometer else GPS_SIGMA_M[1])])
+    return np.array(rows)
+
+
+def widened(sigmas: Array, away: Array) -> Array:
+    """Standard deviations [n, 3], not smaller than what the residuals [n, 3] show robustly, per axis pair."""
+    sigmas = sigmas.copy()
+    for axes in ((0, 1), (2,)):
+        size = np.abs(away[:, axes] / sigmas[:, axes])
+        if np.isfinite(size).sum() >= 8:
+            sigmas[:, axes] *= max(1.0, 1.4826 * float(np.nanmedian(size)))
+    return sigmas
