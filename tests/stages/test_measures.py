@@ -110,6 +110,22 @@ def test_retrieval_counts_hits_by_ground_overlap() -> None:
     assert torch.isnan(lonely.compute())
 
 
+def test_correspondences_decide_among_the_nearest_by_descriptor() -> None:
+    e = torch.eye(6)
+    overlap = torch.tensor([[1.0, 0.5], [0.5, 1.0]]).expand(2, 2, 2)
+    descriptors = torch.stack([torch.stack([e[0], e[1]]), torch.stack([e[0], e[1]])])
+    scenes = torch.tensor([0, 1])
+    assert window_hits(descriptors, overlap, scenes)[0].tolist() == [0, 0]  # each is taken for the other scene's
+    asked: list[list[int]] = []
+
+    def verify(frame: int, others: torch.Tensor) -> torch.Tensor:
+        asked.append(others.tolist())
+        return (others // 2 == frame // 2).float()
+
+    assert window_hits(descriptors, overlap, scenes, verify)[0].tolist() == [2, 2]
+    assert all(frame not in others and len(others) == 3 for frame, others in enumerate(asked))
+
+
 def test_pairs_of_one_scene_in_other_windows_are_neither_positive_nor_negative() -> None:
     batch = make_batch(3, frames=2)
     batch["scene"] = torch.tensor([5, 5, 6])

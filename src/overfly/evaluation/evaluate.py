@@ -19,6 +19,7 @@ from overfly.evaluation.chart import draw
 from overfly.evaluation.measure import Values, cloud_values, surface_values, truths
 from overfly.evaluation.table import Row, tabulate, write_table
 from overfly.files import replacing
+from overfly.networks.verification import GroundViews, agreement, ground_views
 from overfly.stages.retrieval import window_hits
 from overfly.stages.supervision import matching_counts, repeated
 
@@ -89,7 +90,10 @@ def evaluate(
                     left = (reported - started) / measured * (total - len(kept)) / 60
                     log.info("%d of %d windows measured, about %.0f minutes to go", len(kept), total, left)
     windows = list(kept.values())
-    _retrieve(windows, list(networks))
+    for split, loader in loaders.items():
+        own = [kept[key] for key in sorted(key for key in kept if key[0] == split)]
+        for name, network in networks.items():
+            _retrieve(own, loader, name, network)
     rows = tabulate(windows, draws=draws, seed=seed)
     write_table(rows, folder)
     draw(rows, folder / "evaluation.png", networks=list(networks))
@@ -137,20 +141,40 @@ def _encoder(network: Network, batch: Batch) -> list[tuple[Values, dict[str, Any
     return found
 
 
-def _retrieve(windows: list[dict[str, Any]], names: list[str]) -> None:
-    """Add ``retrieval_top1`` to each window: among all frames of all scenes of its split."""
-    for split in dict.fromkeys(window["split"] for window in windows):
-        part = [window for window in windows if window["split"] == split]
-        for name in names:
-            if not part[0]["encoders"][name]["descriptors"]:
-                continue
-            descriptors, overlaps = (
-                torch.tensor([window["encoders"][name][key] for window in part]) for key in ("descriptors", "overlaps")
-            )
-            hits, asked = window_hits(descriptors, overlaps, torch.tensor([window["scene"] for window in part]))
-            for window, hit, some in zip(part, hits.tolist(), asked.tolist(), strict=True):
-                if some:
-                    window["clouds"][name]["retrieval_top1"] = (hit / some, some)
+def _retrieve(windows: list[dict[str, Any]], loader: DataLoader, name: str, network: Network) -> None:
+    """Add retrieval to each window of a split, in the order of the loader: among all frames of all its scenes."""
+    if not windows or not windows[0]["encoders"][name]["descriptors"]:
+        return
+    descriptors, overlaps = (
+        torch.tensor([window["encoders"][name][key] for window in windows]) for key in ("descriptors", "overlaps")
+    )
+    scenes = torch.tensor([window["scene"] for window in windows])
+    log.info("Looking for the frames of %d windows among each other, by %s", len(windows), name)
+    views = _ground_views(loader, network)
+
+    def verify(frame: int, others: Tensor) -> Tensor:
+        return agreement(_of(views, [frame]), _of(views, others))
+
+    for metric, judge in {"retrieval_top1": None, "retrieval_verified_top1": verify}.items():
+        hits, asked = window_hits(descriptors, overlaps, scenes, judge)
+        for window, hit, some in zip(windows, hits.tolist(), asked.tolist(), strict=True):
+            if some:
+                window["clouds"][name][metric] = (hit / some, some)
+
+
+def _ground_views(loader: DataLoader, network: Network) -> GroundViews:
+    """Of all frames of a split, window by window; features in half precision, which is enough to compare them."""
+    parts = []
+    for batch in loader:
+        seen = network.sized(batch)
+        frames = (seen[key].flatten(0, 1) for key in ("images", "intrinsics", "prior_from_window"))
+        found = ground_views(network.network.encoder, *frames)  # type: ignore[arg-type]
+        parts.append(GroundViews(found.maps.half(), found.inside))
+    return GroundViews(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+
+def _of(views: GroundViews, chosen: Any) -> GroundViews:
+    return GroundViews(views.maps[chosen], views.inside[chosen])
 
 
 def _facts(dataset: WindowDataset, index: int) -> dict[str, Any]:

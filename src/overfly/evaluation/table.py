@@ -26,12 +26,12 @@ METRICS = (
     "height_mean_percent_1_view", "height_mean_percent_2_views", "height_mean_percent_3_views",
     "area_1_view", "area_2_views", "area_3_views",
     "fscore_once_2pct", "fscore_once_interpolated_2pct", "measured",
-    "within_sigma", "within_2sigma", "match_top1", "retrieval_top1",
+    "within_sigma", "within_2sigma", "match_top1", "retrieval_top1", "retrieval_verified_top1",
 )  # fmt: skip
 """Weighted means over windows; see :mod:`overfly.evaluation.measure`."""
 
 COLUMNS = (
-    "chamfer_sum_1024", "chamfer_m2", "excess_removed", *METRICS[2:-2], "calibration_error", *METRICS[-2:],
+    "chamfer_sum_1024", "chamfer_m2", "excess_removed", *METRICS[2:-3], "calibration_error", *METRICS[-3:],
 )  # fmt: skip
 
 SURE = ("chamfer_sum_1024", "excess_removed", "height_median_gsd", "height_median_m", "fscore_dense_2pct")
@@ -60,7 +60,8 @@ scenes (one scene is one flight), given from {least} scenes on; evaluation.csv h
 - `within_sigma`, `within_2sigma`: shares of errors below the stated sigma, ideally 0.68 and 0.95;
   `calibration_error`: expected difference between the stated confidence and the share that is right.
 - `match_top1`: key points whose match is within 2 px of the truth; `retrieval_top1`: frames whose most similar other
-  frame, among all scenes of the group, sees common ground.
+  frame, among all scenes of the group, sees common ground, by descriptor alone; `retrieval_verified_top1`: by the
+  correspondences with the nearest of these, each frame seen from above by its own prior pose.
 
 """
 

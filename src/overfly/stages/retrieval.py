@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 from torchmetrics import Metric
@@ -34,18 +36,28 @@ class RetrievalTop1(Metric):
         self.scenes.append(scenes)
 
     def compute(self) -> Tensor:
-        parts = (dim_zero_cat(x) for x in (self.descriptors, self.overlaps, self.scenes))
-        hits, asked = (x.sum() for x in window_hits(*parts))
+        descriptors, overlaps, scenes = (dim_zero_cat(x) for x in (self.descriptors, self.overlaps, self.scenes))
+        hits, asked = (x.sum() for x in window_hits(descriptors, overlaps, scenes))
         return hits / asked if asked else torch.tensor(float("nan"))
 
 
-def window_hits(descriptors: Tensor, overlaps: Tensor, scenes: Tensor) -> tuple[Tensor, Tensor]:
+SHORTLIST = 60
+"""Images nearest by descriptor among which correspondences decide."""
+
+Verify = Callable[[int, Tensor], Tensor]
+
+
+def window_hits(
+    descriptors: Tensor, overlaps: Tensor, scenes: Tensor, verify: Verify | None = None
+) -> tuple[Tensor, Tensor]:
     """How many frames of each window find a frame that overlaps them, and how many overlap any: both [n].
 
     Args:
         descriptors: [n, K, D], all windows of a split.
         overlaps: [n, K, K].
         scenes: [n].
+        verify: of a frame's number in the gallery and those of the shortlist [R], how well each shows its place [R];
+            None takes the first of the list.
     """
     n, k = descriptors.shape[:2]
     gallery, frame_scene = descriptors.flatten(0, 1), scenes.repeat_interleave(k)
@@ -57,8 +69,12 @@ def window_hits(descriptors: Tensor, overlaps: Tensor, scenes: Tensor) -> tuple[
         likeness = descriptors[w] @ gallery.T  # [K, n K]
         likeness[:, (frame_scene == scenes[w]) & (window != w)] = -torch.inf
         likeness[:, w * k : (w + 1) * k].masked_fill_(itself, -torch.inf)
-        best = likeness.argmax(1)
         common = (overlaps[w] > 0) & ~itself
+        best = likeness.argmax(1)
+        for i in range(k):
+            if verify is not None and common[i].any():
+                listed = likeness[i].topk(min(SHORTLIST, int(torch.isfinite(likeness[i]).sum()))).indices
+                best[i] = listed[verify(w * k + i, listed).argmax()]
         own = (best // k) == w
         hit = own & common.gather(1, torch.where(own, best % k, torch.zeros_like(best))[:, None])[:, 0]
         some = common.any(1)
