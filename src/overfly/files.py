@@ -68,14 +68,25 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
         part.unlink(missing_ok=True)
 
 
-def load_arrays(path: Path) -> dict[str, NDArray]:
-    """All arrays of an .npz file; the checksums that it holds are compared.
+@contextmanager
+def opened_arrays(path: Path) -> Iterator[Mapping[str, NDArray]]:
+    """The arrays of an .npz file, each read, and its checksum compared, when it is asked for.
 
     Raises:
         Damaged: it is missing, cut off or changed.
     """
     try:
-        with np.load(path) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+        with path.open("rb") as file, np.load(file) as arrays:
+            yield arrays
     except UNREADABLE as error:
         raise Damaged(path) from error
+
+
+def load_arrays(path: Path) -> dict[str, NDArray]:
+    """All arrays of an .npz file.
+
+    Raises:
+        Damaged: it is missing, cut off or changed.
+    """
+    with opened_arrays(path) as arrays:
+        return {name: arrays[name] for name in arrays}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -350,3 +351,80 @@ def test_stereo_measures_the_ground_without_a_network(tmp_path: Path) -> None:
     assert cloud.views is not None
     assert cloud.views.min() >= 2
     assert mapped(flight, tmp_path / "out", dense="stereo", network=None)["reused"] == ["cameras", "dense"]
+
+
+def test_a_damaged_cloud_is_made_again_and_not_delivered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
+    mapped(flight, out)
+    before = read_cloud(out / "cloud.laz").points
+    tile = next((out / "work").glob("dense-*/*.npz"))
+    content = bytearray(tile.read_bytes())
+    content[len(content) // 3] ^= 0xFF
+    tile.write_bytes(content)
+    assert mapped(flight, out, progress=True)["reused"] == ["cameras"]
+    assert "is damaged and made anew" in capsys.readouterr().err
+    np.testing.assert_array_equal(read_cloud(out / "cloud.laz").points, before)
+    (next((out / "work").glob("cameras-*")) / "block.json").write_text('{"frames": {')
+    assert mapped(flight, out)["reused"] == ["dense"]
+
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+LOCKED = PermissionError(errno.EACCES, "Permission denied")
+
+
+@pytest.mark.parametrize(
+    ("writer", "error", "words"),
+    [
+        ("overfly.mapping.tiles.save_arrays", FULL, "during dense: the disk is full"),
+        ("laspy.LasWriter.write_points", FULL, "during products: the disk is full"),
+        ("rasterio.shutil.copy", OSError("CPLE_FileIO: write failed: No space left on device"), "the disk is full"),
+        ("overfly.mapping.deliver.write_transforms", LOCKED, r"Permission denied .*another folder by --out"),
+    ],
+)
+def test_what_cannot_be_written_is_one_sentence_and_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, writer: str, error: OSError, words: str
+) -> None:
+    flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writer, fail)
+        with pytest.raises(InputError, match=words) as told:
+            mapped(flight, out)
+    assert "\n" not in str(told.value)
+    assert not (out / "map.json").exists()
+    assert not list(out.glob(".*")), "temporary files were left behind"
+    expected = ["cameras"] if "dense" in words else ["cameras", "dense"]
+    assert mapped(flight, out)["reused"] == expected
+
+
+def test_other_errors_of_the_system_are_not_blamed_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise ConnectionResetError(errno.ECONNRESET, "reset")
+
+    monkeypatch.setattr("overfly.mapping.deliver.write_transforms", fail)
+    with pytest.raises(ConnectionResetError):
+        mapped(make_flight(tmp_path / "f"), tmp_path / "out")
+
+
+def test_a_read_only_folder_is_told_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from overfly import cli
+
+    flight = make_flight(tmp_path / "f")
+    out = Path("/proc/overfly")  # where nobody can write, root included
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["overfly", "map", str(flight), "--out", str(out), "--dense", "stereo"])
+        with pytest.raises(SystemExit) as done:
+            cli.main()
+    assert done.value.code == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_an_image_without_bytes_is_named_and_left_out(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "f")
+    (flight / "images" / "9.png").write_bytes(b"")
+    summary = mapped(flight, tmp_path / "out")
+    assert (summary["images"], summary["registered"]) == (5, 4)
+    assert list(summary["skipped"]) == ["9.png"]

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.errors import Damaged
-from overfly.files import UNREADABLE
+from overfly.files import opened_arrays
 from overfly.geometry import Array, Camera, pixel_grid, rays
 from overfly.mapping.anchor import Map, anchored
 
@@ -82,7 +78,7 @@ class DepthMap:
         Raises:
             Damaged: the file is missing, cut off or changed.
         """
-        with self._opened() as data:
+        with opened_arrays(self.path) as data:
             return {
                 "depth": data["depth"],
                 "sigma": data["sigma"].astype(np.float32),
@@ -91,17 +87,9 @@ class DepthMap:
                 "paired": data["paired"],
             }
 
-    @contextmanager
-    def _opened(self) -> Iterator[Any]:
-        try:
-            with np.load(self.path) as data:
-                yield data
-        except UNREADABLE as error:
-            raise Damaged(self.path) from error
-
     def opinion(self) -> Opinion | None:
         """What the network said of the frame, None without one."""
-        with self._opened() as data:
+        with opened_arrays(self.path) as data:
             if "opinion_depth" not in data:
                 return None
             return Opinion(*(data[f"opinion_{name}"] for name in ("depth", "sigma", "confidence", "views", "alone")))

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.cloud import Cloud
-from overfly.errors import Damaged
-from overfly.files import UNREADABLE, save_arrays
+from overfly.files import opened_arrays, save_arrays
 
 PIXELS = 256
 """Least side of a square, ground pixels."""
@@ -79,12 +78,9 @@ def read_part(path: Path) -> Part:
     Raises:
         Damaged: it is missing or damaged.
     """
-    try:
-        with np.load(path) as arrays:
-            gsd, side = (float(v) for v in arrays["facts"])
-            return Part(gsd, side, arrays["squares"], arrays["counts"])
-    except UNREADABLE as error:
-        raise Damaged(path) from error
+    with opened_arrays(path) as arrays:
+        gsd, side = (float(v) for v in arrays["facts"])
+        return Part(gsd, side, arrays["squares"], arrays["counts"])
 
 
 def read_squares(path: Path, numbers: NDArray[np.int64]) -> NDArray:
@@ -93,11 +89,8 @@ def read_squares(path: Path, numbers: NDArray[np.int64]) -> NDArray:
     Raises:
         Damaged: it is missing or damaged.
     """
-    try:
-        with np.load(path) as arrays:
-            found = [arrays[str(i)] for i in numbers]
-    except UNREADABLE as error:
-        raise Damaged(path) from error
+    with opened_arrays(path) as arrays:
+        found = [arrays[str(i)] for i in numbers]
     return np.concatenate(found) if found else np.empty(0, RECORD)
 
 

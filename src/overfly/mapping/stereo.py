@@ -129,7 +129,8 @@ def _drop_damaged(workdir: Path) -> None:
             path.unlink()
     for path in workdir.glob("pair-*.npy"):
         try:
-            np.load(path)
+            with path.open("rb") as file:
+                np.load(file)
         except UNREADABLE:
             path.unlink()
 
