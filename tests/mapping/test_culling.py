@@ -15,7 +15,7 @@ CAMERA = Camera(400, 300, 350.0, 360.0, 190.0, 155.0)
 def test_every_point_inside_the_image_stays_and_most_others_go(gimbal: tuple[float, float, float]) -> None:
     points = np.random.default_rng(0).uniform([-500, -500, 0], [500, 500, 30], (40_000, 3))
     world_from_camera = pose(rotation_from_gimbal(*gimbal), [20.0, -30.0, 100.0])
-    near = Groups(points).near(CAMERA, world_from_camera)
+    near = points[Groups(points).near(CAMERA, world_from_camera)]
 
     def inside(some: np.ndarray) -> np.ndarray:
         pixels, _ = project(some, CAMERA, world_from_camera)
@@ -31,4 +31,4 @@ def test_few_points_and_none() -> None:
     world_from_camera = pose(rotation_from_gimbal(0, -90), [0, 0, 50.0])
     assert len(Groups(np.zeros((0, 3))).near(CAMERA, world_from_camera)) == 0
     one = np.array([[1.0, 2.0, 3.0]])
-    np.testing.assert_array_equal(Groups(one).near(CAMERA, world_from_camera), one)
+    np.testing.assert_array_equal(Groups(one).near(CAMERA, world_from_camera), [0])

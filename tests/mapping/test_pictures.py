@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from overfly.cloud import Cloud
+from overfly.data.footprints import sees
 from overfly.geometry import Camera, pose, rotation_from_gimbal
-from overfly.mapping.gallery import gallery, upright
+from overfly.mapping.gallery import gallery, upright, views_per_cell
 from overfly.mapping.oblique import oblique_view, splat
 from overfly.mapping.pictures import hillshade, jpeg, nice_length, overview, png, top_view
 from overfly.mapping.raster import Grid, Surface
@@ -123,3 +124,19 @@ def test_nice_lengths_and_files() -> None:
     image = np.zeros((8, 8, 3), np.uint8)
     assert png(image).startswith(b"\x89PNG")
     assert jpeg(image).startswith(b"\xff\xd8")
+
+
+def test_views_are_counted_as_if_every_cell_were_looked_at() -> None:
+    seen = overview(town())
+    camera = Camera(400, 320, 300.0, 310.0, 190.0, 165.0, k1=-0.15, k2=0.05, p1=0.002)
+    poses = np.stack(
+        [
+            pose(rotation_from_gimbal(yaw, pitch), [x, y, 45.0])
+            for x, y, yaw, pitch in ((20, 30, 0, -90), (70, 40, 45, -60), (-40, 10, 90, -20), (50, 50, 10, 60))
+        ]
+    )
+    cells = np.concatenate([seen.grid.centres(), seen.heights[..., None]], axis=-1)
+    plain = sum(sees(cells, camera, p).astype(float) for p in poses)
+    found = views_per_cell(seen, [camera] * 4, poses)
+    np.testing.assert_array_equal(found, np.where(seen.filled, plain, np.nan))
+    assert 0 < np.nanmean(found) < 4

@@ -30,10 +30,10 @@ class Groups:
         high = np.maximum.reduceat(ordered, self._starts)
         self._centres, self._radii = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
 
-    def near(self, camera: Camera, world_from_camera: Array) -> Array:
-        """Points [m, 3], in their order, among them all that the undistorted camera has inside its image."""
+    def near(self, camera: Camera, world_from_camera: Array) -> NDArray[np.int64]:
+        """Ascending numbers of points, among them all that the undistorted camera has inside its image."""
         if not len(self.points):
-            return self.points
+            return np.zeros(0, np.int64)
         local = (self._centres - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
         # Inward normals of the four planes through the camera and a side of the image, and of the image plane.
         left, right = -camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
@@ -41,8 +41,5 @@ class Groups:
         planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1.0]])
         planes /= np.linalg.norm(planes, axis=1, keepdims=True)
         groups = np.flatnonzero((local @ planes.T >= -self._radii[:, None] * (1 + 1e-9)).all(1))
-        return self.points[np.sort(self._members(groups))]
-
-    def _members(self, groups: NDArray[np.int64]) -> NDArray[np.int64]:
         at = (self._starts[groups][:, None] + np.arange(GROUP)).ravel()
-        return self._order[at[at < len(self._order)]]
+        return np.sort(self._order[at[at < len(self._order)]])

@@ -12,6 +12,7 @@ from overfly.cloud import Cloud
 from overfly.data.footprints import footprint, sees
 from overfly.geometry import Array, Camera
 from overfly.mapping import pictures
+from overfly.mapping.culling import Groups
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Picture
 
@@ -119,8 +120,17 @@ def views_per_cell(seen: Surface, cameras: Sequence[Camera], poses: Array) -> ND
     """Number of frames that have each cell of the surface inside them [rows, columns]; NaN where it is empty."""
     count = np.full(seen.heights.shape, np.nan)
     points = np.concatenate([seen.grid.centres(), seen.heights[..., None]], axis=-1)[seen.filled]
-    total = np.zeros(len(points))
+    total, groups = np.zeros(len(points)), Groups(points)
     for camera, pose in zip(cameras, poses, strict=True):
-        total += sees(points, camera, pose)
+        # The lens bends what it sees: look for it as far as twice the image.
+        wide = replace(
+            camera.undistorted(),
+            width=2 * camera.width,
+            height=2 * camera.height,
+            cx=camera.cx + camera.width / 2,
+            cy=camera.cy + camera.height / 2,
+        )
+        near = groups.near(wide, pose)
+        total[near] += sees(points[near], camera, pose)
     count[seen.filled] = total
     return count

@@ -143,7 +143,7 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
     groups = Groups(points)
     found: list[tuple[float, float, float] | None] = []
     for camera, pose in zip(cameras, poses):
-        pixels, depth = project(groups.near(camera, pose), camera, pose)
+        pixels, depth = project(groups.points[groups.near(camera, pose)], camera, pose)
         with np.errstate(invalid="ignore"):
             inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
         if inside.sum() < 20:

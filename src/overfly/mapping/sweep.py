@@ -122,7 +122,7 @@ class SweepOpinions:
     def _around(self, i: int) -> Array:
         """Heights of the surface points in a frame, of all if there are few."""
         camera, pose = self.views.full[i], self.views.poses[i]
-        near = self.groups.near(camera, pose)
+        near = self.groups.points[self.groups.near(camera, pose)]
         pixels, _ = project(near, camera, pose)
         with np.errstate(invalid="ignore"):
             inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
