@@ -60,10 +60,11 @@ def _leans(matrix: Array, gimbals: list[tuple[float, float, float] | None], rota
     else:  # level cameras have their x axes in the horizontal plane
         right = rotations[:, :, 0]
         values, vectors = np.linalg.eigh(right.T @ right / len(right))
-        if values[1] < 0.05:
-            return False  # all fly in one direction: their x axes do not tell
-        up, most = vectors[:, 0], LEAN_GUESSED_DEG
-        up = up * np.sign(up @ -rotations[:, :, 2].mean(0))
+        up, most = -rotations[:, :, 2].mean(0), LEAN_GUESSED_DEG
+        if values[1] >= 0.05:
+            up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
+        elif np.linalg.norm(right.mean(0)) > 0.5:
+            return False  # all fly in one direction, and may look ahead: nothing tells
     up = matrix[:3, :3] @ up
     return bool(up[2] / np.linalg.norm(up) < np.cos(np.deg2rad(most)))
 

@@ -76,7 +76,10 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
             if number == 0:
                 raise
             continue
-        places = without_faults(part, places, own, warnings)
+        clean = without_faults(part, places, own, warnings)
+        if np.isnan(clean).sum() > np.isnan(places).sum() and np.isfinite(clean[:, :2]).all(1).sum() >= 2:
+            part = part.moved(by_gps(part.centres, clean, gimbals, part.world_from_camera))
+        places = clean
         ups = np.full((len(part), 3), np.nan)
         if on_a_line(places) or np.isnan(places[:, 2]).all():
             # GPS along a line holds the ends only: the block may have rolled about it.
