@@ -20,6 +20,7 @@ from overfly.mapping.block import Block
 from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
 from overfly.mapping.gallery import gallery, upright
+from overfly.mapping.orthophoto import Orthophoto
 from overfly.mapping.products import WINDOW, raster_products
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Caution, duration, write_report
@@ -76,7 +77,8 @@ def deliver(
         for name in ("dsm.tif", "orthophoto.tif"):
             (out / name).unlink(missing_ok=True)
         if level:
-            raster_products(placed, out, gsd=gsd, window=window)
+            photographs = partial(Orthophoto, block.frames, origin=block.origin if few_placed.epsg else None)
+            raster_products(placed, out, gsd=gsd, painter=photographs, window=window)
             written += ["dsm.tif", "orthophoto.tif"]
         written += ["transforms.json", "map.json"]
     steps.say("products", ", ".join(written[:-1]))

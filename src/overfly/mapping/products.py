@@ -45,18 +45,15 @@ OVERVIEW = 8
 
 
 class Painter(Protocol):
-    """Gives the orthophoto its colours, for example from the photographs.
+    """Gives the orthophoto its colours: :class:`overfly.mapping.orthophoto.Orthophoto` from the photographs."""
 
-    Attributes:
-        reach: how far around a window it looks at the surface, in the grid's unit.
-    """
-
-    @property
-    def reach(self) -> float: ...
+    def halo(self, cell: float) -> float:
+        """How far around a window of cells of that size it looks at the surface, in the grid's unit."""
+        ...
 
     def window(self, grid: Grid, surface: Grid, heights: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """RGB [rows, columns, 3] and alpha [rows, columns] of the cells of ``grid``, from the surface model over it and
-        ``reach`` around it, NaN where empty."""
+        ``halo`` around it, NaN where empty."""
         ...
 
 
@@ -71,7 +68,6 @@ def raster_products(
     gsd: float,
     fill: int = 2,
     painter: PainterMaker | None = None,
-    photo_cell: float | None = None,
     window: int = WINDOW,
 ) -> Grid:
     """Write ``dsm.tif`` and ``orthophoto.tif`` beside each other, as cloud-optimised GeoTIFFs.
@@ -81,8 +77,8 @@ def raster_products(
         out: folder.
         gsd: ground sampling distance in the cloud's unit; see :func:`cell_size`.
         fill: passes that close gaps of single cells.
-        painter: colours the orthophoto; None takes the mean colours of the points.
-        photo_cell: side of the orthophoto's cells with a painter, None: as the surface model's.
+        painter: colours the orthophoto, in cells of one GSD that divide the surface model's; None takes the mean
+            colours of the points, in the surface model's cells.
         window: cells computed at once, each way; what is written does not depend on it.
 
     Returns:
@@ -108,7 +104,8 @@ def raster_products(
         else:
             _draw(cloud, grid, fill, window, heights, None)
         if painter is not None:
-            _paint(heights, grid, painter, photo_cell or grid.cell, photo, few.epsg, window)
+            parts = max(1, round(grid.cell / gsd))
+            _paint(heights, grid, painter, grid.cell / parts, photo, few.epsg, parts * window)
     return grid
 
 
@@ -231,7 +228,7 @@ def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path
     left, top = np.floor(x_min / cell + 1e-6) * cell, np.ceil(y_max / cell - 1e-6) * cell
     size = int(np.ceil((top - y_min) / cell - 1e-6)), int(np.ceil((x_max - left) / cell - 1e-6))
     fine = Grid(float(left), float(top), cell, *size)
-    margin = int(np.ceil(painter.reach / grid.cell)) + 2
+    margin = int(np.ceil(painter.halo(cell) / grid.cell)) + 2
     with _raster(path, fine, epsg, 4, "uint8") as photo:
         for window in windows(fine, cells):
             around = _over(grid, window.grid).wide(margin)
