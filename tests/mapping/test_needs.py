@@ -45,7 +45,7 @@ def test_what_is_held_fits_into_what_is_allowed() -> None:
     least = least_gb(sizes)
     held = [budget(sizes, allowed) for allowed in np.linspace(least, 6, 20)]
     for allowed, found in zip(np.linspace(least, 6, 20), held, strict=True):
-        assert _needed(sizes, 1600, True, found.tile_points, found.held_maps) <= allowed + 1e-9
+        assert _needed(sizes, 1600, True, found.tile_points, found.held_maps, found.sample) <= allowed + 1e-9
     assert [b.tile_points for b in held] == sorted(b.tile_points for b in held)
     assert (held[-1].tile_points, held[-1].held_maps) == (TILE_POINTS[1], HELD_MAPS[1])
     smallest = budget(sizes, 0.01)

@@ -21,7 +21,7 @@ from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
 from overfly.mapping.gallery import gallery, upright
 from overfly.mapping.orthophoto import Orthophoto
-from overfly.mapping.products import WINDOW, raster_products
+from overfly.mapping.products import SAMPLE, WINDOW, raster_products
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Caution, duration, write_report
 from overfly.mapping.settings import MapSettings
@@ -30,10 +30,6 @@ from overfly.mapping.tiles import Tiles
 
 LEVEL = 0.5
 """Cosine of the largest angle between up, as the cameras tell it, and the frame's z axis."""
-
-
-SAMPLE = 2_000_000
-"""Points that tell figures and make pictures: all of a small flight."""
 
 
 def deliver(
@@ -45,6 +41,7 @@ def deliver(
     steps: Steps,
     *,
     window: int = WINDOW,
+    sample: int = SAMPLE,
 ) -> dict[str, Any]:
     """Write every product of a finished cloud into ``out`` and return the content of ``map.json``.
 
@@ -56,13 +53,14 @@ def deliver(
         asked: the settings.
         steps: timing and messages.
         window: cells of the rasters that are computed at once, each way.
+        sample: points that tell figures and make pictures; all of a small flight.
 
     Raises:
         InputError: the cloud is empty, or its extent fits no raster.
     """
     if len(local) == 0:
         raise InputError("No point could be measured: the images overlap too little or show too little texture.")
-    few = local.sample(SAMPLE)
+    few = local.sample(sample)
     gsd = ground_sampling(few, block.cameras, block.poses)
     placed, few_placed = local.moved(partial(georeferenced, block=block)), georeferenced(few, block)
     turn = upright(block.poses)
@@ -78,7 +76,7 @@ def deliver(
             (out / name).unlink(missing_ok=True)
         if level:
             photographs = partial(Orthophoto, block.frames, origin=block.origin if few_placed.epsg else None)
-            raster_products(placed, out, gsd=gsd, painter=photographs, window=window)
+            raster_products(placed, out, gsd=gsd, painter=photographs, window=window, sample=sample)
             written += ["dsm.tif", "orthophoto.tif"]
         written += ["transforms.json", "map.json"]
     steps.say("products", ", ".join(written[:-1]))

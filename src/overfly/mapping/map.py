@@ -40,7 +40,8 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
     flight, steps, identity, asked = _opened(flight_folder, out, settings)
     with _told_when_stopped(steps):
         block, local = _measured(flight, identity, asked, steps)
-        return deliver(flight, block, local, Path(out), asked, steps, window=memory_budget(block, asked).window)
+        held = memory_budget(block, asked)
+        return deliver(flight, block, local, Path(out), asked, steps, window=held.window, sample=held.sample)
 
 
 def align_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> tuple[Flight, Block]:

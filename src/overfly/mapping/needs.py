@@ -23,14 +23,17 @@ DECODED = 8
 MATCHED, COMPARED, HELD = 270, 160, 24
 """Bytes per matched pixel: while pairs are matched, while depth maps are compared, and of each map held; measured."""
 
-PER_POINT = 280
-"""Bytes per point of a tile while it is thinned, measured; rasters and pictures take less."""
+PER_POINT, PER_SAMPLE = 280, 400
+"""Bytes per point of a tile while it is thinned, and of the sample by which figures and pictures are made; measured."""
 
 SHARE = 0.2
 """Points per matched pixel that the frames give before thinning."""
 
 TILE_POINTS = (250_000, 4_000_000)
 """Points of the smallest and the largest tile: smaller ones are mostly margin, larger ones gain nothing."""
+
+SAMPLE = (500_000, 2_000_000)
+"""Fewest and most points of the sample."""
 
 HELD_MAPS = (3, 8)
 """Fewest and most depth maps in memory: with three, most are read more often."""
@@ -47,11 +50,13 @@ class Budget:
         tile_points: of a tile, before thinning.
         held_maps: depth maps.
         window: cells along a window of the rasters.
+        sample: points by which figures and pictures are made.
     """
 
     tile_points: int
     held_maps: int
     window: int
+    sample: int
 
 
 Sizes = Iterable[tuple[int, int]]
@@ -67,17 +72,18 @@ def budget(sizes: Sizes, allowed_gb: float, matched_side: int = 1600, *, network
         int(min(max(room / PER_POINT, TILE_POINTS[0]), TILE_POINTS[1])),
         min(max(maps, HELD_MAPS[0]), HELD_MAPS[1]),
         1024 if room > 1e9 else 512,
+        int(min(max(room / PER_SAMPLE, SAMPLE[0]), SAMPLE[1])),
     )
 
 
 def memory_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
     """Memory that a map takes if enough is there, GB."""
-    return _needed(sizes, matched_side, network, TILE_POINTS[1], HELD_MAPS[1])
+    return _needed(sizes, matched_side, network, TILE_POINTS[1], HELD_MAPS[1], SAMPLE[1])
 
 
 def least_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
     """Memory that a map takes with the smallest tiles and the fewest images in memory, GB."""
-    return _needed(sizes, matched_side, network, TILE_POINTS[0], HELD_MAPS[0])
+    return _needed(sizes, matched_side, network, TILE_POINTS[0], HELD_MAPS[0], SAMPLE[0])
 
 
 def allowed_gb() -> float:
@@ -106,10 +112,11 @@ def core_seconds(sizes: Sizes, matched_side: int = 1600) -> float:
     return CORE_SECONDS_PER_MEGAPIXEL * sum(_matched(size, matched_side) for size in sizes) / 1e6
 
 
-def _needed(sizes: Sizes, matched_side: int, network: bool, tile_points: int, held: int) -> float:
+def _needed(sizes: Sizes, matched_side: int, network: bool, tile_points: int, held: int, sample: int) -> float:
     fixed, largest, total = _parts(sizes, matched_side, network)
-    tile = PER_POINT * min(tile_points, SHARE * total)
-    return fixed + max(MATCHED * largest, (COMPARED + HELD * held) * largest, tile) / 1e9
+    points = SHARE * total
+    cloud = max(PER_POINT * min(tile_points, points), PER_SAMPLE * min(sample, points))
+    return fixed + max(MATCHED * largest, (COMPARED + HELD * held) * largest, cloud) / 1e9
 
 
 def _parts(sizes: Sizes, matched_side: int, network: bool) -> tuple[float, float, float]:

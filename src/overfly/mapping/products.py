@@ -32,10 +32,7 @@ WINDOW = 1024
 """Cells along a window."""
 
 SAMPLE = 2_000_000
-"""Points by which a map's extent is told."""
-
-DENSITY = 4_000_000
-"""Points by which the size of its cells is told."""
+"""Points by which a map's extent is told; twice as many, of whole tiles, tell the size of its cells."""
 
 GDAL_CACHE = 64 * 2**20
 """Bytes that GDAL may hold: by itself it takes a twentieth of the machine."""
@@ -69,6 +66,7 @@ def raster_products(
     fill: int = 2,
     painter: PainterMaker | None = None,
     window: int = WINDOW,
+    sample: int = SAMPLE,
 ) -> Grid:
     """Write ``dsm.tif`` and ``orthophoto.tif`` beside each other, as cloud-optimised GeoTIFFs.
 
@@ -80,6 +78,7 @@ def raster_products(
         painter: colours the orthophoto, in cells of one GSD that divide the surface model's; None takes the mean
             colours of the points, in the surface model's cells.
         window: cells computed at once, each way; what is written does not depend on it.
+        sample: points by which the extent is told; twice as many tell the size of the cells.
 
     Returns:
         The grid of the surface model.
@@ -89,8 +88,8 @@ def raster_products(
     """
     if len(cloud) == 0:
         raise InputError("The cloud holds no points, so there is no surface to draw: check the overlap of the images.")
-    few = cloud.sample(SAMPLE)
-    grid = grid_over(few.points, cell_size(cloud.some(DENSITY), gsd), trim=0.0005)
+    few = cloud.sample(sample)
+    grid = grid_over(few.points, cell_size(cloud.some(2 * sample), gsd), trim=0.0005)
     if grid.rows * grid.columns > max(MAX_CELLS, EMPTIEST * len(cloud)):
         raise InputError(
             f"The surface would have {grid.rows} x {grid.columns} cells of {grid.cell:.3g}: the cloud's extent "
