@@ -17,6 +17,7 @@ from overfly.mapping.needs import (
     allowed_gb,
     budget,
     core_seconds,
+    cores,
     free_gb,
     least_gb,
     memory_gb,
@@ -24,6 +25,7 @@ from overfly.mapping.needs import (
 from overfly.mapping.settings import MapSettings
 
 LARGE = (5472, 3648)
+HELD = ("tile_points", "held_maps", "sample", "workers")
 
 
 def block(count: int = 4, size: tuple[int, int] = LARGE) -> Any:
@@ -45,7 +47,7 @@ def test_what_is_held_fits_into_what_is_allowed() -> None:
     least = least_gb(sizes)
     held = [budget(sizes, allowed) for allowed in np.linspace(least, 6, 20)]
     for allowed, found in zip(np.linspace(least, 6, 20), held, strict=True):
-        assert _needed(sizes, 1600, True, found.tile_points, found.held_maps, found.sample) <= allowed + 1e-9
+        assert _needed(sizes, 1600, True, *(getattr(found, name) for name in HELD)) <= allowed + 1e-9
     assert [b.tile_points for b in held] == sorted(b.tile_points for b in held)
     assert (held[-1].tile_points, held[-1].held_maps) == (TILE_POINTS[1], HELD_MAPS[1])
     smallest = budget(sizes, 0.01)
@@ -68,6 +70,23 @@ def test_what_nobody_said_follows_from_the_machine(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("overfly.mapping.needs.free_gb", lambda: 64.0)
     assert allowed_gb() == 6
     assert few < memory_budget(block(2000), MapSettings(dense="stereo")).tile_points
+
+
+def test_cores_are_those_of_the_process_or_fewer_if_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    own = cores()
+    assert own >= 1
+    for said, meant in (("1", 1), ("4096", own), ("0", own), ("many", own)):
+        monkeypatch.setenv("OMP_NUM_THREADS", said)
+        assert cores() == meant
+
+
+def test_no_more_frames_are_matched_side_by_side_than_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("overfly.mapping.needs.cores", lambda: 16)
+    found = [budget([LARGE] * 9, allowed, network=False).workers for allowed in (0.1, 1.5, 3.0, 60.0)]
+    assert found == sorted(found)
+    assert found[0] == 1
+    assert 1 < found[2] < found[3] == 16
 
 
 def test_time_goes_with_the_matched_pixels() -> None:

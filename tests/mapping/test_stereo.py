@@ -81,6 +81,33 @@ def test_finished_depth_maps_are_reused_and_give_the_same(hill, strips, camera, 
     assert not list((tmp_path / "work").glob("pair-*"))
 
 
+def test_several_workers_give_the_same(hill, strips, camera, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    frames = hill.frames(tmp_path, camera, [*strips[:3], *strips[5:7]], known=True)
+    alone = stereo(frames, workdir=tmp_path / "one")
+    together = stereo(frames, workdir=tmp_path / "three", workers=3)
+    assert [m.partners for m in together] == [m.partners for m in alone]
+    for one, other in zip(alone, together, strict=True):
+        for name, values in one.load().items():
+            np.testing.assert_array_equal(values, other.load()[name])
+    assert not list((tmp_path / "three").glob("pair-*"))
+
+
+def test_a_failure_in_a_worker_is_told_and_leaves_what_is_done(hill, strips, camera, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    frames = hill.frames(tmp_path, camera, strips[:3], known=True)
+
+    def failing(views, points):  # type: ignore[no-untyped-def]
+        def answer(i, partners, measured):  # type: ignore[no-untyped-def]
+            if i == 2:
+                raise InputError("Frame 2 is odd.")
+
+        return answer
+
+    with pytest.raises(InputError, match="Frame 2"):
+        stereo(frames, workdir=tmp_path / "work", workers=2, opinions=failing)
+    assert (tmp_path / "work" / "depth-00000.npz").is_file()
+    assert len(stereo(frames, workdir=tmp_path / "work", workers=2)) == 3
+
+
 def test_bad_input_is_named(hill, strips, camera, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     frames = hill.frames(tmp_path, camera, strips[:2], known=True)
     with pytest.raises(InputError, match="at least two frames"):

@@ -211,6 +211,7 @@ def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinio
             max_size=asked.size,
             seed=asked.seed,
             opinions=opinions,
+            workers=held.workers,
             progress=update,
         )
     with steps.bar("dense", "fused") as update, steps.bar("dense", "tiles") as update_tiles:

@@ -51,12 +51,14 @@ class Budget:
         held_maps: depth maps.
         window: cells along a window of the rasters.
         sample: points by which figures and pictures are made.
+        workers: frames that are matched side by side.
     """
 
     tile_points: int
     held_maps: int
     window: int
     sample: int
+    workers: int
 
 
 Sizes = Iterable[tuple[int, int]]
@@ -73,17 +75,25 @@ def budget(sizes: Sizes, allowed_gb: float, matched_side: int = 1600, *, network
         min(max(maps, HELD_MAPS[0]), HELD_MAPS[1]),
         1024 if room > 1e9 else 512,
         int(min(max(room / PER_SAMPLE, SAMPLE[0]), SAMPLE[1])),
+        min(max(int(room / max(MATCHED * largest, 1)), 1), cores()),
     )
 
 
 def memory_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
     """Memory that a map takes if enough is there, GB."""
-    return _needed(sizes, matched_side, network, TILE_POINTS[1], HELD_MAPS[1], SAMPLE[1])
+    return _needed(sizes, matched_side, network, TILE_POINTS[1], HELD_MAPS[1], SAMPLE[1], cores())
 
 
 def least_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
     """Memory that a map takes with the smallest tiles and the fewest images in memory, GB."""
-    return _needed(sizes, matched_side, network, TILE_POINTS[0], HELD_MAPS[0], SAMPLE[0])
+    return _needed(sizes, matched_side, network, TILE_POINTS[0], HELD_MAPS[0], SAMPLE[0], 1)
+
+
+def cores() -> int:
+    """Cores that may be used: those of this process, or fewer where ``OMP_NUM_THREADS`` says so, as elsewhere."""
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    said = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, min(own, int(said))) if said.isdigit() and int(said) else own
 
 
 def allowed_gb() -> float:
@@ -112,11 +122,13 @@ def core_seconds(sizes: Sizes, matched_side: int = 1600) -> float:
     return CORE_SECONDS_PER_MEGAPIXEL * sum(_matched(size, matched_side) for size in sizes) / 1e6
 
 
-def _needed(sizes: Sizes, matched_side: int, network: bool, tile_points: int, held: int, sample: int) -> float:
+def _needed(
+    sizes: Sizes, matched_side: int, network: bool, tile_points: int, held: int, sample: int, workers: int
+) -> float:
     fixed, largest, total = _parts(sizes, matched_side, network)
     points = SHARE * total
     cloud = max(PER_POINT * min(tile_points, points), PER_SAMPLE * min(sample, points))
-    return fixed + max(MATCHED * largest, (COMPARED + HELD * held) * largest, cloud) / 1e9
+    return fixed + max(workers * MATCHED * largest, (COMPARED + HELD * held) * largest, cloud) / 1e9
 
 
 def _parts(sizes: Sizes, matched_side: int, network: bool) -> tuple[float, float, float]:

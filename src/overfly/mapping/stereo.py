@@ -8,7 +8,9 @@ frames at a time whatever the size of the flight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +44,9 @@ SURE = 0.6
 BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
+AHEAD = 2
+"""Frames that are begun for each worker before the first of them is finished."""
+
 REFINED_SIGMA = 0.25
 """The same after refinement, pixels of the full size."""
 
@@ -55,6 +60,7 @@ def stereo(
     neighbours: int = 4,
     seed: int = 0,
     opinions: Callable[[Views, Array], Opinions] | None = None,
+    workers: int = 1,
     progress: Progress | None = None,
 ) -> list[DepthMap]:
     """Depth maps of all frames that have a partner.
@@ -67,6 +73,7 @@ def stereo(
         neighbours: most partners of a frame.
         seed: of the coarse look's sample.
         opinions: a network's say in each frame's depth, made from the views and the surface points [M, 3].
+        workers: frames that are worked on side by side; what comes out does not depend on it.
         progress: called with (frames done, frames in all).
 
     Raises:
@@ -93,31 +100,70 @@ def stereo(
         for i in pair:
             waiting[i].append(pair)
     _drop_damaged(workdir)
-    maps: list[DepthMap] = []
-    for i in range(len(frames)):
-        path = workdir / f"depth-{i:05d}.npz"
-        if not waiting[i]:
-            continue
-        if not path.is_file():
+
+    def match(pair: tuple[int, int]) -> None:
+        if not _pair_file(workdir, pair).is_file():
+            _match(flight, pair, ranges, workdir)
+
+    def measure(i: int, ready: Sequence[Future[None]]) -> None:
+        for one in ready:  # they were asked for before, so that somebody is at them or has done them
+            one.result()
+        # Pairs of this frame; correlate with every frame that took part, the chosen ones first.
+        chosen = partners[i] + [j for j in _all(waiting[i], i) if j not in partners[i]]
+        _depth(flight, i, waiting[i], chosen[:neighbours], ranges, workdir, _depth_file(workdir, i), ask)
+
+    asked = [i for i in range(len(frames)) if waiting[i]]
+    with in_threads(workers) as pool:
+        matches: dict[tuple[int, int], Future[None]] = {}
+        running: dict[int, Future[None]] = {}
+        for done, i in enumerate(asked):
+            for k in asked[done : done + AHEAD * workers]:
+                if k not in running and not _depth_file(workdir, k).is_file():
+                    matches |= {pair: pool.submit(match, pair) for pair in waiting[k] if pair not in matches}
+                    running[k] = pool.submit(measure, k, [matches[pair] for pair in waiting[k]])
+            if i in running:
+                running.pop(i).result()
             for pair in waiting[i]:
-                if not _pair_file(workdir, pair).is_file():
-                    _match(flight, pair, ranges, workdir)
-            # Pairs of this frame; correlate with every frame that took part, the chosen ones first.
-            others = [j for pair in waiting[i] for j in pair if j != i]
-            chosen = partners[i] + [j for j in others if j not in partners[i]]
-            chosen = chosen[:neighbours]
-            _depth(flight, i, waiting[i], chosen, ranges, workdir, path, ask)
-        maps.append(
-            DepthMap(
-                frames[i].name, flight.full[i], flight.poses[i], [frames[j].name for j in _all(waiting[i], i)], path
-            )
+                if pair[1] == i:  # the later of the two frames: nobody needs it any more
+                    matches.pop(pair, None)
+                    _pair_file(workdir, pair).unlink(missing_ok=True)
+            if progress:
+                progress(i + 1, len(frames))
+    return [
+        DepthMap(
+            frames[i].name,
+            flight.full[i],
+            flight.poses[i],
+            [frames[j].name for j in _all(waiting[i], i)],
+            _depth_file(workdir, i),
         )
-        for pair in waiting[i]:
-            if pair[1] == i:  # the later of the two frames: nobody needs it any more
-                _pair_file(workdir, pair).unlink(missing_ok=True)
-        if progress:
-            progress(i + 1, len(frames))
-    return maps
+        for i in asked
+    ]
+
+
+@contextmanager
+def in_threads(workers: int) -> Iterator[Executor]:
+    """A pool of threads, each of which computes on one core: more threads below them would only get in their way.
+
+    What waits is dropped when the block ends early.
+    """
+    import cv2
+    import torch
+
+    before = cv2.getNumThreads(), torch.get_num_threads()
+
+    def alone() -> None:
+        if workers > 1:
+            cv2.setNumThreads(1)
+            torch.set_num_threads(1)
+
+    pool = ThreadPoolExecutor(max_workers=workers, initializer=alone)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+        cv2.setNumThreads(before[0])
+        torch.set_num_threads(before[1])
 
 
 def _drop_damaged(workdir: Path) -> None:
@@ -181,6 +227,10 @@ def _sample(depth: Map, camera: Camera, world_from_camera: Array, step: int = 8)
 
 def _all(pairs: list[tuple[int, int]], i: int) -> list[int]:
     return [j for pair in pairs for j in pair if j != i]
+
+
+def _depth_file(workdir: Path, i: int) -> Path:
+    return workdir / f"depth-{i:05d}.npz"
 
 
 def _pair_file(workdir: Path, pair: tuple[int, int]) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
+from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
@@ -61,6 +62,7 @@ class SweepOpinions:
         self.ground_height = ground_height
         self.cameras = [octave_camera(camera, run.network.size) for camera in views.full]
         self._image = lru_cache(maxsize=16)(lambda i: views.small(i, self.cameras[i]))
+        self._lock = Lock()
 
     def __call__(self, i: int, partners: list[int], measured: Array) -> Opinion | None:
         """The surface of frame i, compared with its partners; None where the frame sees no ground.
@@ -69,7 +71,13 @@ class SweepOpinions:
             i: index of the frame.
             partners: of others.
             measured: surface points [M, 3] of this frame, by which the ground is known best.
+
+        One frame at a time: the network takes the most memory of all, and its kernels are not made for threads.
         """
+        with self._lock:
+            return self._say(i, partners, measured)
+
+    def _say(self, i: int, partners: list[int], measured: Array) -> Opinion | None:
         import torch
 
         size = self.cameras[i].width, self.cameras[i].height
