@@ -55,7 +55,7 @@ def test_what_is_held_fits_into_what_is_allowed() -> None:
 
 
 def test_only_what_cannot_fit_is_refused() -> None:
-    least = least_gb([LARGE] * 4, network=False)
+    least = least_gb([LARGE] * 2000, network=False)
     check_memory(block(2000), MapSettings(dense="stereo", max_memory_gb=least + 0.01))
     with pytest.raises(InputError, match=r"at the least.*--max-memory 0\.2.*--size than 1600"):
         check_memory(block(), MapSettings(dense="stereo", max_memory_gb=0.2))

@@ -26,6 +26,9 @@ MATCHED, COMPARED, HELD = 270, 160, 24
 PER_POINT, PER_SAMPLE = 280, 400
 """Bytes per point of a tile while it is thinned, and of the sample by which figures and pictures are made; measured."""
 
+PHOTOGRAPHS = 512e6
+"""Bytes of decoded images that the orthophoto keeps at most (:class:`overfly.mapping.orthophoto.Orthophoto`)."""
+
 SHARE = 0.2
 """Points per matched pixel that the frames give before thinning."""
 
@@ -67,14 +70,16 @@ Sizes = Iterable[tuple[int, int]]
 
 def budget(sizes: Sizes, allowed_gb: float, matched_side: int = 1600, *, network: bool = True) -> Budget:
     """What fits into ``allowed_gb``; the smallest possible if nothing does (:func:`least_gb`)."""
+    sizes = list(sizes)
     fixed, largest, _ = _parts(sizes, matched_side, network)
     room = (allowed_gb - fixed) * 1e9
+    photographs = min(PHOTOGRAPHS, 3.0 * sum(width * height for width, height in sizes))
     maps = int((room / max(largest, 1) - COMPARED) / HELD)
     return Budget(
         int(min(max(room / PER_POINT, TILE_POINTS[0]), TILE_POINTS[1])),
         min(max(maps, HELD_MAPS[0]), HELD_MAPS[1]),
         1024 if room > 1e9 else 512,
-        int(min(max(room / PER_SAMPLE, SAMPLE[0]), SAMPLE[1])),
+        int(min(max((room - photographs) / PER_SAMPLE, SAMPLE[0]), SAMPLE[1])),
         min(max(int(room / max(MATCHED * largest, 1)), 1), cores()),
     )
 
@@ -125,10 +130,12 @@ def core_seconds(sizes: Sizes, matched_side: int = 1600) -> float:
 def _needed(
     sizes: Sizes, matched_side: int, network: bool, tile_points: int, held: int, sample: int, workers: int
 ) -> float:
+    sizes = list(sizes)
     fixed, largest, total = _parts(sizes, matched_side, network)
     points = SHARE * total
-    cloud = max(PER_POINT * min(tile_points, points), PER_SAMPLE * min(sample, points))
-    return fixed + max(workers * MATCHED * largest, (COMPARED + HELD * held) * largest, cloud) / 1e9
+    photographs = min(PHOTOGRAPHS, 3.0 * sum(width * height for width, height in sizes))
+    thinning, products = PER_POINT * min(tile_points, points), PER_SAMPLE * min(sample, points) + photographs
+    return fixed + max(workers * MATCHED * largest, (COMPARED + HELD * held) * largest, thinning, products) / 1e9
 
 
 def _parts(sizes: Sizes, matched_side: int, network: bool) -> tuple[float, float, float]:
