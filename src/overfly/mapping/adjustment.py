@@ -17,7 +17,7 @@ from overfly.mapping.bundle import Bundle, Index
 from overfly.mapping.normal_equations import LENS, Images, Reduced, Rows, point_steps, rotated, skew
 
 CAUCHY = 2.0
-"""Residuals above this many standard deviations lose their weight: images, controls' pixels, focal lengths."""
+"""Residuals above this many standard deviations lose their weight: images and controls' pixels."""
 
 HUBER = 2.8
 """The same of GPS and verticals, whose weight falls more gently (the 95 % bound of three normal values)."""
@@ -25,8 +25,8 @@ HUBER = 2.8
 FIXED = 1e-7
 """Standard deviation of what is not estimated."""
 
-LENS_SIGMA = (0.1, 0.1)
-"""Standard deviations of k1, k2 about zero: more is no lens that a drone carries, but a bent block."""
+LENS_SIGMA = 0.1
+"""Standard deviation of k1, k2 about zero: more is no lens that a drone carries, but a bent block."""
 
 LEVER_SIGMA_M = 0.3
 """Of the antenna's place in the camera's axes: lever arm, and delay times speed."""
@@ -45,6 +45,7 @@ class Held:
         places, place_sigmas: GPS positions of the images [n, 3] and their standard deviations, metres.
         ups: the vertical in camera axes [n, 3], unit length, with ``up_sigma`` in radians.
         focals: focal lengths by the photos' data [c], pixels, with ``focal_sigma`` as a share.
+        lens_sigma: standard deviation of k1 and k2 about zero.
         lens_fixed: cameras that keep their calibration [c].
         knows: coordinates of points [m, 3], such as controls, and ``know_sigmas``, metres.
         lever: whether the antenna's place in the camera's axes is estimated.
@@ -61,6 +62,7 @@ class Held:
     know_sigmas: Array
     up_sigma: float = np.deg2rad(3.0)
     focal_sigma: float = 0.02
+    lens_sigma: float = LENS_SIGMA
     lever: bool = False
     datum: bool = False
 
@@ -98,6 +100,11 @@ class Adjusted:
     datum: Array = field(default_factory=lambda: np.zeros(3))
     variance: float = 1.0
     reduced: Reduced | None = None
+
+    @property
+    def cost(self) -> float:
+        """Half the robust sum of squares."""
+        return _cost(self)
 
     def away(self) -> Array:
         """Residuals of GPS [n, 3], metres: cameras with antenna and common shift, minus what GPS tells."""
@@ -216,10 +223,9 @@ def _rows(state: Adjusted) -> Rows:
                 rows.add(0.0, [column + i], [1 / FIXED])
             continue
         if np.isfinite(held.focals[j]):
-            rows.add(np.log(b.lenses[j, 0] / held.focals[j]) / held.focal_sigma, [column], [1 / held.focal_sigma],
-                     cauchy=CAUCHY)  # fmt: skip
+            rows.add(np.log(b.lenses[j, 0] / held.focals[j]) / held.focal_sigma, [column], [1 / held.focal_sigma])
         for i in range(2):
-            rows.add(b.lenses[j, 3 + i] / LENS_SIGMA[i], [column + 1 + i], [1 / LENS_SIGMA[i]])
+            rows.add(b.lenses[j, 3 + i] / held.lens_sigma, [column + 1 + i], [1 / held.lens_sigma])
     for i in range(3):
         rows.add(state.lever[i] / LEVER_SIGMA_M if held.lever else 0.0, [lever + i],
                  [1 / (LEVER_SIGMA_M if held.lever else FIXED)])  # fmt: skip

@@ -12,7 +12,7 @@ from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array
-from overfly.mapping.adjustment import Adjusted, Held, adjusted, free
+from overfly.mapping.adjustment import LENS_SIGMA, Adjusted, Held, adjusted, free
 from overfly.mapping.block import Block
 from overfly.mapping.bundle import Bundle, bundle_of
 from overfly.mapping.control import control_origin
@@ -33,6 +33,16 @@ WORST_PX = 3.0
 """Rays that miss their point by more are dropped."""
 
 FOCAL_DRIFT = 0.1
+FOCAL_SUSPECT = 0.03
+"""Shares by which a focal length may differ from the photos' data before this is said, and before the images are mapped
+again with the focal length held."""
+
+GAIN = 0.01
+"""Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
+
+NO_LENS_SIGMA = 0.001
+LOOSE = 10.0
+
 FOCAL_SIGMA = 0.02
 """Standard deviation of a focal length by the photo's own data, as a share."""
 
@@ -90,8 +100,15 @@ def align(
                 f"No two of the {len(flight)} images could be placed together (best pair: "
                 f"{strongest_pair(database)} common points, 15 needed): give sharp images that overlap by 30 % or more."
             )
-        parts = [bundle_of(model, {name: i for i, name in enumerate(names)}) for model in models]
-        block = _held_block(flight, parts, origin, told, control, warnings, seed)
+        numbers = {name: i for i, name in enumerate(names)}
+        parts = [bundle_of(model, numbers) for model in models]
+        drifted = focal_drift(parts[0], flight.frames) > FOCAL_SUSPECT
+        if drifted:
+            # Over flat ground a focal length without limits may run away, and everything with it.
+            models = mapped(database, flight.root, workdir / "held", names=names, seed=seed, calibrate=False)
+            held = [bundle_of(model, numbers) for model in models]
+            parts = held if held and len(held[0]) >= len(parts[0]) else parts
+        block = _held_block(flight, parts, origin, told, control, warnings, seed, drifted)
         update(2, 2)
     return block
 
@@ -121,6 +138,7 @@ def _held_block(
     control: str,
     warnings: list[str],
     seed: int,
+    drifted: bool,
 ) -> Block:
     """The adjusted block, by what there is: GPS and controls, either, or the ground alone."""
     at = None
@@ -144,6 +162,7 @@ def _held_block(
         bundle = parts[0]
         # A scale near metres: the unit of a sparse model is arbitrary.
         result = adjusted_twice(bundle, held_by_images(bundle, flight.frames), flight.frames)
+    result = calibrated(result, drifted)
     ruled: Controlled | None = None
     if flight.gcps and control != "none":
         if at is None and (origin := control_origin(flight.gcps)) is not None:
@@ -173,13 +192,16 @@ def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
         free(bundle, NOISE_PX * shrunk[bundle.image]),
         focals=np.array(focals, float),
         focal_sigma=FOCAL_SIGMA,
+        lens_sigma=NO_LENS_SIGMA,
         lens_fixed=count < FEWEST_TO_CALIBRATE,
     )
 
 
 def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjusted:
     """Adjusted, then again without the rays that miss, and with GPS weighed by what it turned out to be worth."""
-    result = adjusted(bundle, held, tolerance=1.0)
+    # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
+    loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
+    result = adjusted(bundle, loose, tolerance=1.0)
     shrunk = np.array([max(1.0, max(frames[i].width, frames[i].height) / LONGEST_SIDE) for i in bundle.frames])
     good = result.bundle.errors() <= WORST_PX * shrunk[bundle.image]
     kept = result.bundle.kept(good)
@@ -190,10 +212,41 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
         ups=held.ups,
         focals=held.focals,
         focal_sigma=held.focal_sigma,
+        lens_sigma=held.lens_sigma,
         lens_fixed=held.lens_fixed,
         lever=held.lever,
     )
     return adjusted(kept, again, lever=result.lever)
+
+
+def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
+    """Adjusted with the lens free, then without prior of the focal length, where the images clearly ask for it.
+
+    Over level ground seen from one height they hardly tell a lens or a focal length from a bent block, and formal
+    precision cannot decide: rolling shutter and the lens leave errors that all rays of a region have in common. So a
+    share of the whole cost must be gained.
+
+    Args:
+        result: with focal length and lens held.
+        drifted: whether the focal length may be another than the photos' data tell.
+    """
+    lens = adjusted(result.bundle, replace(result.held, lens_sigma=LENS_SIGMA), lever=result.lever)
+    if result.cost - lens.cost > GAIN * lens.cost:
+        result = lens
+    if drifted:
+        held = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
+        focal = adjusted(result.bundle, held, lever=result.lever)
+        result = focal if result.cost - focal.cost > GAIN * focal.cost else result
+    return result
+
+
+def focal_drift(bundle: Bundle, frames: Sequence[Frame]) -> float:
+    """How far the focal lengths are from the photos' own data at most, as a share."""
+    drift = 0.0
+    for j in range(len(bundle.lenses)):
+        prior = focal_px(frames[int(bundle.frames[np.flatnonzero(bundle.lens_of == j)[0]])])
+        drift = max(drift, 0.0 if not prior else abs(float(bundle.lenses[j, 0]) / prior - 1))
+    return drift
 
 
 def _remark_focal(bundle: Bundle, frames: list[Frame], warnings: list[str]) -> None:

@@ -21,28 +21,33 @@ THREADS = 1
 """Sums in the order of one thread: the same seed gives the same cameras to the last bit."""
 
 
-def mapped(database: Path, images: Path, workdir: Path, *, names: Sequence[str], seed: int) -> list[Any]:
+def mapped(
+    database: Path, images: Path, workdir: Path, *, names: Sequence[str], seed: int, calibrate: bool = True
+) -> list[Any]:
     """Models without common frames, the largest first; empty where no two frames could be placed.
 
     Global mapping with tracks of three frames or more is tried first; at 30 % overlap most ground is seen twice only,
     so that frames left out ask for two-view tracks, and then for incremental mapping, which places them one by one.
-    What is still left is tried against the best model with few common points, then among itself.
+    What is still left is tried against the best model with few common points, then among itself. Unless told to
+    ``calibrate``, cameras keep the focal lengths that the database has.
     """
     best = None
     for views in (3, 2):
         if views == 3 and len(names) < 3:
             continue
-        best = _better(best, _global(database, images, _folder(workdir / f"global{views}"), names, views, seed))
+        best = _better(
+            best, _global(database, images, _folder(workdir / f"global{views}"), names, views, seed, calibrate)
+        )
         if best is not None and best.num_reg_images() == len(names):
             return [best]
-    best = _better(best, _incremental(database, images, _folder(workdir / "incremental"), names, seed))
+    best = _better(best, _incremental(database, images, _folder(workdir / "incremental"), names, seed, calibrate))
     if best is None:
         return []
     models, left = [best], _left(names, [best])
     if left:
         models = [_better(best, _extended(best, database, images, workdir, seed))]
     while len(left := _left(names, models)) >= 2:
-        more = _incremental(database, images, _folder(workdir / f"part{len(models)}"), left, seed)
+        more = _incremental(database, images, _folder(workdir / f"part{len(models)}"), left, seed, calibrate)
         part = _better(None, more)
         if part is None or part.num_reg_images() < 2:
             break
@@ -55,7 +60,9 @@ def _left(names: Sequence[str], models: Sequence[Any]) -> list[str]:
     return [name for name in names if name not in placed]
 
 
-def _global(database: Path, images: Path, folder: Path, names: Sequence[str], views: int, seed: int) -> dict[int, Any]:
+def _global(
+    database: Path, images: Path, folder: Path, names: Sequence[str], views: int, seed: int, calibrate: bool
+) -> dict[int, Any]:
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
@@ -67,13 +74,13 @@ def _global(database: Path, images: Path, folder: Path, names: Sequence[str], vi
     options.mapper.global_positioning.min_num_view_per_track = views
     options.mapper.bundle_adjustment.min_track_length = 2
     options.mapper.retriangulation.ignore_two_view_tracks = False
-    if len(names) < FEWEST_TO_CALIBRATE:
+    if not calibrate or len(names) < FEWEST_TO_CALIBRATE:
         options.mapper.bundle_adjustment.refine_focal_length = False
         options.mapper.bundle_adjustment.refine_extra_params = False
     return _attempt(partial(pycolmap.global_mapping, database, images, folder, options))
 
 
-def _pipeline(names: Sequence[str], seed: int) -> Any:
+def _pipeline(names: Sequence[str], seed: int, calibrate: bool) -> Any:
     import pycolmap
 
     pipeline = pycolmap.IncrementalPipelineOptions()
@@ -84,31 +91,36 @@ def _pipeline(names: Sequence[str], seed: int) -> Any:
     pipeline.extract_colors = False
     pipeline.triangulation.ignore_two_view_tracks = False
     pipeline.image_names = list(names)
-    if len(names) < FEWEST_TO_CALIBRATE:
+    if not calibrate or len(names) < FEWEST_TO_CALIBRATE:
         pipeline.ba_refine_focal_length = False
         pipeline.ba_refine_extra_params = False
+    if not calibrate:
+        pipeline.mapper.abs_pose_refine_focal_length = False
+        pipeline.mapper.abs_pose_refine_extra_params = False
+    if len(names) < FEWEST_TO_CALIBRATE:
         pipeline.mapper.init_min_num_inliers = 30
         pipeline.mapper.init_min_tri_angle = 4
     return pipeline
 
 
-def _incremental(database: Path, images: Path, folder: Path, names: Sequence[str], seed: int) -> dict[int, Any]:
+def _incremental(
+    database: Path, images: Path, folder: Path, names: Sequence[str], seed: int, calibrate: bool
+) -> dict[int, Any]:
     import pycolmap
 
-    return _attempt(partial(pycolmap.incremental_mapping, database, images, folder, _pipeline(names, seed)))
+    pipeline = _pipeline(names, seed, calibrate)
+    return _attempt(partial(pycolmap.incremental_mapping, database, images, folder, pipeline))
 
 
 def _extended(model: Any, database: Path, images: Path, workdir: Path, seed: int) -> dict[int, Any]:
     """The model with frames that share a few points only; what it has stays as it is."""
     import pycolmap
 
-    pipeline = _pipeline([], seed)
+    pipeline = _pipeline([], seed, calibrate=False)
     pipeline.multiple_models = False
     pipeline.fix_existing_frames = True
     pipeline.constant_cameras = set(model.cameras)
     pipeline.mapper.abs_pose_min_num_inliers = FEWEST_INLIERS
-    pipeline.mapper.abs_pose_refine_focal_length = False
-    pipeline.mapper.abs_pose_refine_extra_params = False
     start = _folder(workdir / "placed")
     model.write(start)
     folder = _folder(workdir / "extended")

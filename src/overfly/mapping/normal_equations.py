@@ -41,15 +41,12 @@ class Rows:
         values: Sequence[float] | Array,
         *,
         huber: float = np.inf,
-        cauchy: float = np.inf,
     ) -> None:
-        """One residual; above ``huber`` or ``cauchy`` (in standard deviations) it loses weight."""
+        """One residual; above ``huber`` (in standard deviations) it loses weight."""
         size, number = abs(float(residual)), len(self._residuals)
         weight, cost = 1.0, 0.5 * size**2
         if size > huber:
             weight, cost = huber / size, huber * (size - 0.5 * huber)
-        if np.isfinite(cauchy):
-            weight, cost = 1 / (1 + (size / cauchy) ** 2), 0.5 * cauchy**2 * float(np.log1p((size / cauchy) ** 2))
         root = float(np.sqrt(weight))
         self._residuals.append(float(residual) * root)
         self._costs.append(cost)
