@@ -17,6 +17,9 @@ from overfly.mapping.bundle import Bundle
 
 FEWEST = 3
 FEWEST_TO_CHECK = 4
+FEWEST_TO_TELL_HEIGHTS = 5
+"""Controls from which heights and positions get a spread of their own."""
+
 CHECK_SHARE = 0.25
 
 CLICK_PX = 1.0
@@ -240,6 +243,8 @@ def spread_m(source: Array, target: Array, *, scaled: bool) -> Array:
     """Standard deviation [2] of controls, horizontal and vertical, metres: what a similarity (else a shift) leaves."""
     away = transform(fit_similarity(source, target, rotate=scaled, scale=scaled), source) - target
     share = np.sqrt(3 * len(source) / max(3 * len(source) - (7 if scaled else 3), 1))
+    if len(source) < FEWEST_TO_TELL_HEIGHTS:  # three heights fit any plane
+        return np.full(2, np.sqrt((away**2).mean()) * share)
     return np.array([np.sqrt((away[:, :2] ** 2).mean()), np.sqrt((away[:, 2] ** 2).mean())]) * share
 
 

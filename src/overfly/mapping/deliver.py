@@ -17,6 +17,7 @@ from overfly.flights import Flight, Frame, write_transforms
 from overfly.geodesy import crs_from_enu
 from overfly.geometry import transform
 from overfly.mapping.block import Block
+from overfly.mapping.block_marks import marks_of
 from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
 from overfly.mapping.gallery import gallery, upright
@@ -90,6 +91,7 @@ def deliver(
             unit="m" if block.metric else "units",
             height_offset=float(np.median(few_placed.points[:, 2] - few.points[:, 2])),
             missing=list(block.gps_positions(lost_frames(flight, block)).items()),
+            marks=marks_of(block) if level and block.cameras_from == "estimated" else None,
         )
     summary = summarise(flight, block, cloud_facts(placed, few_placed, seen, gsd), few_placed.epsg, asked, steps)
     found = _cautions(flight, block, seen, summary, level)

@@ -12,6 +12,7 @@ from overfly.cloud import Cloud
 from overfly.data.footprints import footprint, sees
 from overfly.geometry import Array, Camera
 from overfly.mapping import pictures
+from overfly.mapping.block_marks import Marks
 from overfly.mapping.culling import Groups
 from overfly.mapping.raster import Surface
 from overfly.mapping.report import Picture
@@ -51,6 +52,7 @@ def gallery(
     unit: str,
     height_offset: float = 0.0,
     missing: Sequence[tuple[str, NDArray]] = (),
+    marks: Marks | None = None,
 ) -> tuple[list[Picture], Surface]:
     """All pictures of a report.
 
@@ -61,6 +63,7 @@ def gallery(
         unit: of lengths, for the scale bars.
         height_offset: height of the product minus z here.
         missing: name and position [>=2] of frames that were not registered.
+        marks: what holds the block, in the same frame.
     """
     seen = pictures.overview(cloud, min_cell=2 * gsd)
     ground = float(np.nanmedian(seen.heights))
@@ -69,6 +72,14 @@ def gallery(
     shown_points = cloud
     if len(cloud) > SHOWN:
         shown_points = cloud[np.random.default_rng(0).choice(len(cloud), SHOWN, replace=False)]
+    taken = "Where the registered images were taken"
+    if marks is not None and marks.links:
+        taken += (
+            " and what they cover. Lines join images with common points, the darker the more; residuals and sigma are "
+            "drawn longer by the factor stated."
+        )
+    else:
+        taken += " (dots, joined in the order of the flight) and what they cover."
     up = "north is up" if unit == "m" else "the frame's y axis is up, where north is nobody knows"
     shown = [
         Picture(
@@ -92,8 +103,12 @@ def gallery(
         Picture(
             "The flight",
             "Images",
-            "Where the registered images were taken (dots, joined in the order of the flight) and what they cover.",
-            pictures.png(pictures.block_map(seen, poses[:, :3, 3], outlines, missing=missing, names=names, unit=unit)),
+            taken,
+            pictures.png(
+                pictures.block_map(
+                    seen, poses[:, :3, 3], outlines, missing=missing, names=names, marks=marks, unit=unit
+                )
+            ),
         ),
         Picture(
             "The flight",

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from overfly.cloud import Cloud
 from overfly.geometry import Array, rotation_from_gimbal
+from overfly.mapping.block_marks import Marks, draw_links, draw_residuals, scale_of
 from overfly.mapping.oblique import PAPER, oblique_view
 from overfly.mapping.raster import Grid, Surface, grid_over, surface
 
@@ -155,6 +156,7 @@ def block_map(
     *,
     missing: Sequence[tuple[str, ArrayLike]] = (),
     names: Sequence[str] = (),
+    marks: Marks | None = None,
     unit: str = "m",
     width_in: float = 5.6,
 ) -> Image:
@@ -166,6 +168,7 @@ def block_map(
         outlines: their footprints [4, 2].
         missing: name and x, y of frames that were not registered but whose GPS is known.
         names: labels of the first and last frame.
+        marks: links, residuals and ground control, drawn with their factor.
     """
     points = np.asarray(positions, float).reshape(-1, np.shape(positions)[-1] if np.size(positions) else 3)[:, :2]
     corners = [o for o in outlines if np.isfinite(o).all()]
@@ -173,9 +176,10 @@ def block_map(
     x_min, x_max, y_min, y_max = seen.grid.extent
     everything = np.concatenate([points, lost, *corners, [[x_min, y_min], [x_max, y_max]]])
     # An oblique footprint may reach far away: keep the map readable.
-    size = max(x_max - x_min, y_max - y_min)
-    low = np.maximum(everything.min(0), np.array([x_min, y_min]) - size)
-    high = np.minimum(everything.max(0), np.array([x_max, y_max]) + size)
+    margin = 0.25 * max(x_max - x_min, y_max - y_min)
+    inside = np.concatenate([points, lost, [[x_min, y_min], [x_max, y_max]]])
+    low = np.maximum(everything.min(0), inside.min(0) - margin)
+    high = np.minimum(everything.max(0), inside.max(0) + margin)
     cell = max(high - low) / 600
     frame = Grid(low[0], high[1], cell, int((high[1] - low[1]) / cell) + 1, int((high[0] - low[0]) / cell) + 1)
     figure, axes = _map_figure(frame, width_in)
@@ -185,8 +189,15 @@ def block_map(
     for corner in corners:
         axes.fill(corner[:, 0], corner[:, 1], facecolor=GOOD, edgecolor=GOOD, alpha=0.06 * many)
         axes.fill(corner[:, 0], corner[:, 1], fill=False, edgecolor=GOOD, linewidth=0.5, alpha=0.7 * many)
-    axes.plot(points[:, 0], points[:, 1], "-", color=INK, linewidth=0.7, alpha=0.6)
+    if marks is None or not marks.links:
+        axes.plot(points[:, 0], points[:, 1], "-", color=INK, linewidth=0.7, alpha=0.6)
+    else:
+        draw_links(axes, points, marks.links)
     axes.plot(points[:, 0], points[:, 1], "o", color=GOOD, markersize=4, label=f"registered ({len(points)})")
+    if marks is not None:
+        factor = scale_of(marks, float(np.ptp(points, axis=0).max()))
+        draw_residuals(axes, points, marks, factor)
+        axes.plot([], [], " ", label=f"residuals and sigma {factor:g} times")
     if len(lost):
         axes.plot(lost[:, 0], lost[:, 1], "x", color=BAD, markersize=7, mew=2, label=f"not registered ({len(lost)})")
         for (name, _), (x, y) in list(zip(missing, lost, strict=True))[:12]:
