@@ -22,6 +22,9 @@ from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles, write_tiles
 
+BLOCK_FORM = 2
+"""Of what is kept of a block: one that an older form kept is not read."""
+
 FEWEST_POINTS = 30
 """Sparse points that tell the height of the ground."""
 
@@ -99,7 +102,7 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
     steps.say("images", _about(flight))
     ruled = [asked.control] if flight.gcps and asked.control != "split" else []
     matched = [asked.seed, *ruled, *([] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)])]
-    key = key_of(__version__, identity, estimate, matched if estimate else None)
+    key = key_of(__version__, BLOCK_FORM, identity, estimate, matched if estimate else None)
     block = steps.kept(
         "cameras",
         key,
