@@ -68,7 +68,9 @@ class Tiles:
         return sum(tile.points for tile in self.tiles)
 
     def __iter__(self) -> Iterator[Cloud]:
-        return (self.tile(i) for i in range(len(self.tiles)))
+        # What is read once from end to end need not stay.
+        read = self.tile if len(self.tiles) <= HELD else self._read
+        return (read(i) for i in range(len(self.tiles)))
 
     def _read(self, i: int) -> Cloud:
         cloud = Cloud(**load_arrays(self.folder / self.tiles[i].file), epsg=self.tiles[i].epsg)
@@ -105,7 +107,7 @@ class Tiles:
         """Whole tiles, spread over the map, of together about so many points; at least one, if there is any."""
         each = len(self) / max(len(self.tiles), 1)
         step = max(1, int(np.ceil(len(self.tiles) * each / most))) if each else 1
-        return [self.tile(i) for i in range(step // 2, len(self.tiles), step)]
+        return [self._read(i) for i in range(step // 2, len(self.tiles), step)]
 
     def whole(self) -> Cloud:
         """The cloud in memory: for small flights."""
