@@ -31,6 +31,9 @@ LENS_SIGMA = 0.1
 LEVER_SIGMA_M = 0.3
 """Of the antenna's place in the camera's axes: lever arm, and delay times speed."""
 
+UP_SIGMA = np.deg2rad(1.3)
+"""Of a vertical by the gimbal: what its readings scatter by against the images on a real flight."""
+
 MOST_STEPS = 60
 TOLERANCE = 0.02
 """What a step must still gain of half the sum of squares: 0.02 moves the unknowns by a fifth of their precision."""
@@ -60,7 +63,7 @@ class Held:
     lens_fixed: NDArray[np.bool_]
     knows: Array
     know_sigmas: Array
-    up_sigma: float = np.deg2rad(3.0)
+    up_sigma: float = UP_SIGMA
     focal_sigma: float = 0.02
     lens_sigma: float = LENS_SIGMA
     lever: bool = False

@@ -41,7 +41,8 @@ class Placed:
         bundle: all parts.
         places: GPS positions [n, 3], NaN where unknown or wrong.
         sigmas: their standard deviations [n, 3], metres.
-        ups: the vertical in camera axes [n, 3] of images that GPS does not level; NaN for the others.
+        ups: the vertical in camera axes [n, 3]: by the gimbals, which level a small block as well as GPS does; of
+            images without one, where GPS does not level the block, as it stands; NaN for the others.
         apart: frames that no common points but GPS alone connects to the largest part.
     """
 
@@ -80,12 +81,9 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
         if np.isnan(clean).sum() > np.isnan(places).sum() and np.isfinite(clean[:, :2]).all(1).sum() >= 2:
             part = part.moved(by_gps(part.centres, clean, gimbals, part.world_from_camera))
         places = clean
-        ups = np.full((len(part), 3), np.nan)
-        if on_a_line(places) or np.isnan(places[:, 2]).all():
-            # GPS along a line holds the ends only: the block may have rolled about it.
-            if on_a_line(places):
-                part = part.moved(level_line(part.centres, gimbals, part.world_from_camera))
-            ups = _ups(part, gimbals)
+        if on_a_line(places):  # GPS along a line holds the ends only: the block may have rolled about it
+            part = part.moved(level_line(part.centres, gimbals, part.world_from_camera))
+        ups = _ups(part, gimbals, level=on_a_line(places) or bool(np.isnan(places[:, 2]).all()))
         sigmas = gps_sigmas(own)
         if np.isnan(places[:, 2]).all():  # the heights stay as they are, so that the equations are regular
             places[:, 2] = np.where(np.isfinite(places[:, 0]), part.centres[:, 2], np.nan)
@@ -140,9 +138,9 @@ def _some(chosen: NDArray[np.bool_], frames: Sequence[Frame]) -> str:
     return f"{len(names)} images ({', '.join(names[:5])}{' …' if len(names) > 5 else ''})"
 
 
-def _ups(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
-    """The vertical in camera axes [n, 3], by the gimbal where there is one, else as the levelled bundle has it."""
-    ups = bundle.rotations[:, :, 2].copy()
+def _ups(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None], *, level: bool) -> Array:
+    """The vertical in camera axes [n, 3]: by the gimbal; without one as the levelled bundle has it, else NaN."""
+    ups = bundle.rotations[:, :, 2].copy() if level else np.full((len(bundle), 3), np.nan)
     for k, gimbal in enumerate(gimbals):
         if gimbal is not None:
             ups[k] = rotation_from_gimbal(*gimbal)[2]
