@@ -203,7 +203,8 @@ def test_failed_write_keeps_the_old_file(cloud: Cloud, tmp_path: Path, monkeypat
 def test_voxel_thin_keeps_one_point_per_voxel() -> None:
     points = np.array([[0, 0, 0], [0.4, 0, 0], [1.1, 0, 0], [0, 1.2, 0], [0.1, 0.1, 0.1]])
     assert_array_equal(voxel_thin(points, 1.0), [0, 2, 3])
-    assert_array_equal(voxel_thin(points + np.array([0.7, 0, 0]), 1.0), [0, 1, 3])  # voxels stand still where points move
+    # Voxels stand still where points move.
+    assert_array_equal(voxel_thin(points + np.array([0.7, 0, 0]), 1.0), [0, 1, 3])
     far = np.vstack([points, [[1e9, 1e9, 1e9]]])
     assert_array_equal(voxel_thin(far, 0.1), [0, 1, 2, 3, 4, 5])
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from overfly.cloud import Cloud
@@ -22,7 +24,7 @@ def test_residuals_links_and_controls_change_the_picture() -> None:
         pictures.block_map(seen, positions, [], marks=marks)
         for marks in (None, Marks(), Marks(whole.links), Marks(whole.links, whole.gps), whole)
     ]
-    for before, after in zip(drawn, drawn[1:], strict=False):
+    for before, after in pairwise(drawn):
         assert before.shape != after.shape or (before != after).any()
 
 
