@@ -57,10 +57,10 @@ def build(flight: Path, out: Path, dense: str, size: int) -> None:
 
     start = time.perf_counter()
     network = load_network(None) if dense == "sweep" else None
-    _, block, cloud = measure_flight(
+    _, block, tiles = measure_flight(
         flight, out=out, cameras="estimate", dense=dense, size=size, network=network, progress=False
     )
-    meshed = time.perf_counter()
+    cloud, meshed = tiles.whole(), time.perf_counter()
     write_mesh(rough_mesh(cloud, faces=FACES), out / "rough.ply")
     now, used = time.perf_counter(), os.times()
     figures: dict[str, Any] = {
