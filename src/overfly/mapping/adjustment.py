@@ -35,6 +35,9 @@ UP_SIGMA = np.deg2rad(1.3)
 """Of a vertical by the gimbal: what its readings scatter by against the images on a real flight."""
 
 MOST_STEPS = 60
+FREE_STEP = 1e-9
+"""Damping below which the block as a whole moves freely: GPS is weak against the sum of all rays."""
+
 TOLERANCE = 0.02
 """What a step must still gain of half the sum of squares: 0.02 moves the unknowns by a fifth of their precision."""
 
@@ -157,7 +160,7 @@ def adjusted(
             break
         gain, state, cost = cost - found, trial, found
         images = _images(state)
-        if gain < tolerance and damping < 1e-6:  # damped steps are short, whatever is still to gain
+        if gain < tolerance and damping <= FREE_STEP:  # damped steps are short, whatever is still to gain
             break
         damping = max(damping / 10, 1e-10)
     freedom = 2 * len(bundle.image) - 6 * len(bundle) - 3 * len(bundle.points)

@@ -43,6 +43,9 @@ GAIN = 0.01
 NO_LENS_SIGMA = 0.001
 LOOSE = 10.0
 
+ROUGHLY = 1.0
+"""What a step must still gain before the decisions; the last adjustment goes on to the end."""
+
 FOCAL_SIGMA = 0.02
 """Standard deviation of a focal length by the photo's own data, as a share."""
 
@@ -179,7 +182,7 @@ def _held_block(
         lift = by_ground(bundle.centres, bundle.points, bundle.world_from_camera, seed)
         result = replace(result, bundle=bundle.moved(lift))
     _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
-    return _block(result, flight.frames, origin, metric, ruled, apart, warnings)
+    return _block(result, flight.frames, origin, metric, ruled, at is not None, apart, warnings)
 
 
 def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
@@ -201,7 +204,7 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
     """Adjusted, then again without the rays that miss, and with GPS weighed by what it turned out to be worth."""
     # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
     loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
-    result = adjusted(bundle, loose, tolerance=1.0)
+    result = adjusted(bundle, loose, tolerance=ROUGHLY)
     shrunk = np.array([max(1.0, max(frames[i].width, frames[i].height) / LONGEST_SIDE) for i in bundle.frames])
     good = result.bundle.errors() <= WORST_PX * shrunk[bundle.image]
     kept = result.bundle.kept(good)
@@ -216,7 +219,7 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
         lens_fixed=held.lens_fixed,
         lever=held.lever,
     )
-    return adjusted(kept, again, lever=result.lever)
+    return adjusted(kept, again, lever=result.lever, tolerance=ROUGHLY)
 
 
 def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
@@ -230,14 +233,15 @@ def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
         result: with focal length and lens held.
         drifted: whether the focal length may be another than the photos' data tell.
     """
-    lens = adjusted(result.bundle, replace(result.held, lens_sigma=LENS_SIGMA), lever=result.lever)
+    held = replace(result.held, lens_sigma=LENS_SIGMA)
+    lens = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
     if result.cost - lens.cost > GAIN * lens.cost:
         result = lens
     if drifted:
         held = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
-        focal = adjusted(result.bundle, held, lever=result.lever)
+        focal = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
         result = focal if result.cost - focal.cost > GAIN * focal.cost else result
-    return result
+    return adjusted(result.bundle, result.held, lever=result.lever)
 
 
 def focal_drift(bundle: Bundle, frames: Sequence[Frame]) -> float:
@@ -266,6 +270,7 @@ def _block(
     origin: Origin | None,
     metric: bool,
     ruled: Controlled | None,
+    told: bool,
     apart: list[str],
     warnings: list[str],
 ) -> Block:
@@ -290,6 +295,7 @@ def _block(
         survey=None if ruled is None else ruled.survey,
         precision=precision_of(result) if metric else Precision(why_not="no GPS and no control gives the block metres"),
         links=[(i, j, count) for (i, j), count in bundle.links().items()],
+        antenna=(float(result.lever[0]), float(result.lever[1]), float(result.lever[2])) if origin and told else None,
         held_by_gps=apart,
         warnings=warnings,
     )

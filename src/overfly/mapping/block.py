@@ -31,6 +31,7 @@ class Block:
         survey: what ground control says, None where the flight has none or it was not asked.
         precision: standard deviations of the cameras, None of given cameras.
         links: (i, j, number of common points) of frames i < j.
+        antenna: where GPS is measured in the cameras' axes [3], metres: lever arm, and delay times speed.
         held_by_gps: names of frames that only GPS connects to the others.
         warnings: sentences for the user.
     """
@@ -44,6 +45,7 @@ class Block:
     survey: Survey | None = None
     precision: Precision | None = None
     links: list[tuple[int, int, int]] = field(default_factory=list)
+    antenna: tuple[float, float, float] | None = None
     held_by_gps: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -71,22 +73,29 @@ class Block:
                     found[frame.name][2] = np.nan
         return found
 
+    def gps_residuals(self) -> Array:
+        """GPS minus camera [n, 3], metres, NaN where unknown; antenna and known shift against control taken out."""
+        told = self.gps_positions()
+        nothing = np.full(3, np.nan)
+        away = np.array([told.get(name, nothing) for name in self.names]) - self.poses[:, :3, 3]
+        if self.antenna is not None:
+            away -= self.poses[:, :3, :3] @ np.array(self.antenna)
+        if self.survey is not None and self.survey.gps_shift_m is not None:
+            away -= self.survey.gps_shift_m
+        return away
+
     def gps_rms(self) -> dict[str, float | None] | None:
         """RMS distance of the cameras from their own GPS; None without GPS.
 
-        A constant shift in height is taken out, and in the plane too where ground control tells it.
+        The antenna and a constant shift in height are taken out, and one in the plane where ground control tells it.
         """
-        told = self.gps_positions()
-        if not told:
+        away = self.gps_residuals()
+        if np.isnan(away[:, :2]).all():
             return None
-        positions = dict(zip(self.names, self.poses[:, :3, 3], strict=True))
-        away = np.array([positions[name] - told[name] for name in told])
-        if self.survey is not None and self.survey.gps_shift_m is not None:
-            away[:, :2] += self.survey.gps_shift_m[:2]
         rises = away[np.isfinite(away[:, 2]), 2]
         vertical = float(np.sqrt(np.mean((rises - np.median(rises)) ** 2))) if len(rises) else None
         return {
-            "horizontal_m": round(float(np.sqrt((away[:, :2] ** 2).sum(1).mean())), 3),
+            "horizontal_m": round(float(np.sqrt(np.nanmean((away[:, :2] ** 2).sum(1)))), 3),
             "vertical_m": None if vertical is None else round(vertical, 3),
         }
 
@@ -134,6 +143,7 @@ def write_block(block: Block, folder: Path) -> None:
         "survey": None if block.survey is None else asdict(block.survey),
         "precision": None if block.precision is None else block.precision.to_json(),
         "links": block.links,
+        "antenna": block.antenna,
         "held_by_gps": block.held_by_gps,
         "warnings": block.warnings,
     }
@@ -166,6 +176,7 @@ def read_block(folder: Path, flight: Flight) -> Block:
         survey_from(content["survey"]),
         precision_from(content["precision"]),
         [(i, j, count) for i, j, count in content["links"]],
+        None if content["antenna"] is None else tuple(content["antenna"]),
         content["held_by_gps"],
         content["warnings"],
     )

@@ -34,13 +34,7 @@ class Marks:
 
 def marks_of(block: Block) -> Marks:
     """The marks of a block."""
-    told = block.gps_positions()
-    gps = np.full((len(block.frames), 2), np.nan)
-    for k, frame in enumerate(block.frames):
-        if frame.name in told:
-            gps[k] = told[frame.name][:2] - block.poses[k, :2, 3]
-    if block.survey is not None and block.survey.gps_shift_m is not None:
-        gps -= block.survey.gps_shift_m[:2]
+    gps = block.gps_residuals()[:, :2]
     positions = None if block.precision is None else block.precision.position_m
     sigmas = None if positions is None else positions[:, :2]
     return Marks(block.links, gps if np.isfinite(gps).any() else None, sigmas, block.survey)

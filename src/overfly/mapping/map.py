@@ -22,7 +22,7 @@ from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles, write_tiles
 
-BLOCK_FORM = 2
+BLOCK_FORM = 3
 """Of what is kept of a block: one that an older form kept is not read."""
 
 FEWEST_POINTS = 30
