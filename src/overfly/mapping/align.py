@@ -12,42 +12,22 @@ from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array
-from overfly.mapping.adjustment import LENS_SIGMA, Adjusted, Held, adjusted, free
+from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
 from overfly.mapping.bundle import Bundle, bundle_of
+from overfly.mapping.calibration import FOCAL_SUSPECT, adjusted_twice, calibrated, focal_drift, held_by_images
 from overfly.mapping.control import control_origin
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, strongest_pair
-from overfly.mapping.features import LONGEST_SIDE
 from overfly.mapping.georeference import by_ground
 from overfly.mapping.matches import Bar, matched
-from overfly.mapping.model import FEWEST_TO_CALIBRATE, mapped
-from overfly.mapping.placing import UNKNOWN_M, placed, widened
+from overfly.mapping.model import mapped
+from overfly.mapping.placing import UNKNOWN_M, placed
 from overfly.mapping.survey import Precision
 from overfly.networks.encoder import Encoder
 
-NOISE_PX = 0.25
-"""Standard deviation of a key point, pixels of the picture that was searched: it weighs the images against GPS."""
-
-WORST_PX = 3.0
-"""Rays that miss their point by more are dropped."""
-
 FOCAL_DRIFT = 0.1
-FOCAL_SUSPECT = 0.03
-"""Shares by which a focal length may differ from the photos' data before this is said, and before the images are mapped
-again with the focal length held."""
-
-GAIN = 0.01
-"""Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
-
-NO_LENS_SIGMA = 0.001
-LOOSE = 10.0
-
-ROUGHLY = 1.0
-"""What a step must still gain before the decisions; the last adjustment goes on to the end."""
-
-FOCAL_SIGMA = 0.02
-"""Standard deviation of a focal length by the photo's own data, as a share."""
+"""Share by which a focal length may differ from the photos' data before this is said."""
 
 
 def align(
@@ -183,74 +163,6 @@ def _held_block(
         result = replace(result, bundle=bundle.moved(lift))
     _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
     return _block(result, flight.frames, origin, metric, ruled, at is not None, apart, warnings)
-
-
-def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
-    """What the images and the photos' own data say of a bundle: the weights of its rays, priors of its cameras."""
-    own = [frames[i] for i in bundle.frames]
-    shrunk = np.array([max(1.0, max(frame.width, frame.height) / LONGEST_SIDE) for frame in own])
-    count = np.bincount(bundle.lens_of, minlength=len(bundle.lenses))
-    focals = [focal_px(own[int(np.flatnonzero(bundle.lens_of == j)[0])]) or np.nan for j in range(len(count))]
-    return replace(
-        free(bundle, NOISE_PX * shrunk[bundle.image]),
-        focals=np.array(focals, float),
-        focal_sigma=FOCAL_SIGMA,
-        lens_sigma=NO_LENS_SIGMA,
-        lens_fixed=count < FEWEST_TO_CALIBRATE,
-    )
-
-
-def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjusted:
-    """Adjusted, then again without the rays that miss, and with GPS weighed by what it turned out to be worth."""
-    # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
-    loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
-    result = adjusted(bundle, loose, tolerance=ROUGHLY)
-    shrunk = np.array([max(1.0, max(frames[i].width, frames[i].height) / LONGEST_SIDE) for i in bundle.frames])
-    good = result.bundle.errors() <= WORST_PX * shrunk[bundle.image]
-    kept = result.bundle.kept(good)
-    again = replace(
-        free(kept, NOISE_PX * shrunk[kept.image]),
-        places=held.places,
-        place_sigmas=widened(held.place_sigmas, result.away()),
-        ups=held.ups,
-        focals=held.focals,
-        focal_sigma=held.focal_sigma,
-        lens_sigma=held.lens_sigma,
-        lens_fixed=held.lens_fixed,
-        lever=held.lever,
-    )
-    return adjusted(kept, again, lever=result.lever, tolerance=ROUGHLY)
-
-
-def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
-    """Adjusted with the lens free, then without prior of the focal length, where the images clearly ask for it.
-
-    Over level ground seen from one height they hardly tell a lens or a focal length from a bent block, and formal
-    precision cannot decide: rolling shutter and the lens leave errors that all rays of a region have in common. So a
-    share of the whole cost must be gained.
-
-    Args:
-        result: with focal length and lens held.
-        drifted: whether the focal length may be another than the photos' data tell.
-    """
-    held = replace(result.held, lens_sigma=LENS_SIGMA)
-    lens = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
-    if result.cost - lens.cost > GAIN * lens.cost:
-        result = lens
-    if drifted:
-        held = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
-        focal = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
-        result = focal if result.cost - focal.cost > GAIN * focal.cost else result
-    return adjusted(result.bundle, result.held, lever=result.lever)
-
-
-def focal_drift(bundle: Bundle, frames: Sequence[Frame]) -> float:
-    """How far the focal lengths are from the photos' own data at most, as a share."""
-    drift = 0.0
-    for j in range(len(bundle.lenses)):
-        prior = focal_px(frames[int(bundle.frames[np.flatnonzero(bundle.lens_of == j)[0]])])
-        drift = max(drift, 0.0 if not prior else abs(float(bundle.lenses[j, 0]) / prior - 1))
-    return drift
 
 
 def _remark_focal(bundle: Bundle, frames: list[Frame], warnings: list[str]) -> None:

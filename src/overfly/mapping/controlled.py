@@ -12,21 +12,17 @@ from overfly.geodesy import Origin
 from overfly.geometry import Array, fit_similarity, transform
 from overfly.mapping.adjustment import Adjusted, Held, adjusted
 from overfly.mapping.bundle import Bundle
+from overfly.mapping.clicks import Control, Seen, click_sigma, see, with_controls
 from overfly.mapping.control import (
     FEWEST,
     FEWEST_TO_CHECK,
-    Control,
-    Seen,
     checks_of,
-    click_sigma,
     consistent,
     flat,
     projected_epsg,
     read_controls,
-    see,
     spread_m,
-    with_controls,
-)  # fmt: skip
+)
 from overfly.mapping.survey import Survey, SurveyedPoint
 
 SURVEY_SIGMA_M = 0.01

@@ -1,0 +1,108 @@
+"""What the images and the photos' own data weigh in an adjustment, and how far they may calibrate a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from overfly.flights import Frame
+from overfly.mapping.adjustment import LENS_SIGMA, Adjusted, Held, adjusted, free
+from overfly.mapping.bundle import Bundle
+from overfly.mapping.database import focal_px
+from overfly.mapping.features import LONGEST_SIDE
+from overfly.mapping.model import FEWEST_TO_CALIBRATE
+from overfly.mapping.placing import widened
+
+NOISE_PX = 0.25
+"""Standard deviation of a key point, pixels of the picture that was searched: it weighs the images against GPS."""
+
+WORST_PX = 3.0
+"""Rays that miss their point by more are dropped."""
+
+FOCAL_SUSPECT = 0.03
+"""Share by which a focal length may differ from the photos' data before the images are mapped again with it held."""
+
+FOCAL_SIGMA = 0.02
+"""Standard deviation of a focal length by the photo's own data, as a share."""
+
+GAIN = 0.01
+"""Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
+
+NO_LENS_SIGMA = 0.001
+"""Standard deviation of k1 and k2 until the images ask for a lens."""
+
+LOOSE = 10.0
+"""Factor on the standard deviation of GPS until it has shown what it is worth."""
+
+ROUGHLY = 1.0
+"""What a step must still gain before the decisions; the last adjustment goes on to the end."""
+
+
+def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
+    """What the images and the photos' own data say of a bundle: the weights of its rays, priors of its cameras."""
+    own = [frames[i] for i in bundle.frames]
+    shrunk = np.array([max(1.0, max(frame.width, frame.height) / LONGEST_SIDE) for frame in own])
+    count = np.bincount(bundle.lens_of, minlength=len(bundle.lenses))
+    focals = [focal_px(own[int(np.flatnonzero(bundle.lens_of == j)[0])]) or np.nan for j in range(len(count))]
+    return replace(
+        free(bundle, NOISE_PX * shrunk[bundle.image]),
+        focals=np.array(focals, float),
+        focal_sigma=FOCAL_SIGMA,
+        lens_sigma=NO_LENS_SIGMA,
+        lens_fixed=count < FEWEST_TO_CALIBRATE,
+    )
+
+
+def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjusted:
+    """Adjusted, then again without the rays that miss, and with GPS weighed by what it turned out to be worth."""
+    # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
+    loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
+    result = adjusted(bundle, loose, tolerance=ROUGHLY)
+    shrunk = np.array([max(1.0, max(frames[i].width, frames[i].height) / LONGEST_SIDE) for i in bundle.frames])
+    good = result.bundle.errors() <= WORST_PX * shrunk[bundle.image]
+    kept = result.bundle.kept(good)
+    again = replace(
+        free(kept, NOISE_PX * shrunk[kept.image]),
+        places=held.places,
+        place_sigmas=widened(held.place_sigmas, result.away()),
+        ups=held.ups,
+        focals=held.focals,
+        focal_sigma=held.focal_sigma,
+        lens_sigma=held.lens_sigma,
+        lens_fixed=held.lens_fixed,
+        lever=held.lever,
+    )
+    return adjusted(kept, again, lever=result.lever, tolerance=ROUGHLY)
+
+
+def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
+    """Adjusted with the lens free, then without prior of the focal length, where the images clearly ask for it.
+
+    Over level ground seen from one height they hardly tell a lens or a focal length from a bent block, and formal
+    precision cannot decide: rolling shutter and the lens leave errors that all rays of a region have in common. So a
+    share of the whole cost must be gained.
+
+    Args:
+        result: with focal length and lens held.
+        drifted: whether the focal length may be another than the photos' data tell.
+    """
+    held = replace(result.held, lens_sigma=LENS_SIGMA)
+    lens = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
+    if result.cost - lens.cost > GAIN * lens.cost:
+        result = lens
+    if drifted:
+        held = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
+        focal = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
+        result = focal if result.cost - focal.cost > GAIN * focal.cost else result
+    return adjusted(result.bundle, result.held, lever=result.lever)
+
+
+def focal_drift(bundle: Bundle, frames: Sequence[Frame]) -> float:
+    """How far the focal lengths are from the photos' own data at most, as a share."""
+    drift = 0.0
+    for j in range(len(bundle.lenses)):
+        prior = focal_px(frames[int(bundle.frames[np.flatnonzero(bundle.lens_of == j)[0]])])
+        drift = max(drift, 0.0 if not prior else abs(float(bundle.lenses[j, 0]) / prior - 1))
+    return drift
