@@ -16,6 +16,7 @@ from overfly.mapping.clicks import Control, Seen, click_sigma, see, with_control
 from overfly.mapping.control import (
     FEWEST,
     FEWEST_TO_CHECK,
+    FEWEST_TO_TELL_HEIGHTS,
     checks_of,
     consistent,
     flat,
@@ -147,7 +148,7 @@ def _weighed(
     for turn in range(ROUNDS):
         ruled = _with_knowledge(held, views, places, sigma, sizes, gps=with_gps)
         state = adjusted(state.bundle, ruled, lever=state.lever, datum=state.datum)
-        if turn == ROUNDS - 1 or len(views) <= FEWEST:  # three leave next to nothing to estimate a spread from
+        if turn == ROUNDS - 1 or len(views) < FEWEST_TO_TELL_HEIGHTS:  # little is left to estimate a spread from
             break
         off = state.bundle.points[first:] - places
         redundancy = 1 - np.einsum("kii->ki", state.point_covariances(np.arange(first, first + len(views)))) / (
