@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,20 @@ from overfly.geodesy import Origin, geodetic_from_enu
 from overfly.geometry import Array, Camera, on_plane, pixel_grid, pose, rays, rotation_from_gimbal
 
 ORIGIN = Origin(52.2, 21.0, 100.0)
+
+
+@contextmanager
+def bar(step: str, what: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar that shows nothing."""
+    yield lambda done, total: None
+
+
+@pytest.fixture(scope="module")
+def few_features() -> Iterator[None]:
+    """Small images need few key points, and tests little time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("overfly.mapping.features.FEATURES", 1200)
+        yield
 
 
 class Hill:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from conftest import bar
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame, read_flight
 from overfly.geodesy import Origin, enu_from_geodetic, geodetic_from_enu
@@ -19,18 +20,7 @@ from overfly.mapping.align import align
 from overfly.mapping.database import focal_px
 from overfly.mapping.features import image_pairs
 
-
-@contextmanager
-def bar(step: str, what: str):  # type: ignore[no-untyped-def]
-    yield lambda done, total: None
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_features():  # type: ignore[no-untyped-def]
-    """Small images need few key points, and tests little time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("overfly.mapping.features.FEATURES", 1200)
-        yield
+pytestmark = pytest.mark.usefixtures("few_features")
 
 
 def centre_errors(block, poses) -> np.ndarray:  # type: ignore[no-untyped-def]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from conftest import ORIGIN
+from conftest import ORIGIN, bar
 from overfly.flights import ControlPoint, Flight
 from overfly.geodesy import crs_from_enu, enu_from_geodetic, geodetic_from_enu
 from overfly.geometry import fit_similarity, project, transform
@@ -18,24 +17,14 @@ from overfly.mapping.align import align
 from overfly.mapping.block import read_block, write_block
 from overfly.mapping.control import checks_of, consistent
 
+pytestmark = pytest.mark.usefixtures("few_features")
+
 CRS = "EPSG:32634"
 ZONE = replace(ORIGIN, epsg=32634)
 SHIFT = np.array([2.0, -1.0, -40.0])
 """Of the controls against GPS, metres."""
 
 PLACES = np.array([[-30.0, -30], [30, -30], [30, 30], [-30, 30], [0, 5], [10, -20], [-12, 22], [22, 8]])
-
-
-@contextmanager
-def bar(step: str, what: str):  # type: ignore[no-untyped-def]
-    yield lambda done, total: None
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_features():  # type: ignore[no-untyped-def]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("overfly.mapping.features.FEATURES", 1200)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from conftest import bar
 from overfly.errors import InputError
 from overfly.flights import Flight
 from overfly.geometry import fit_similarity, project, transform
@@ -24,11 +24,6 @@ from overfly.networks.encoder import Encoder
 from overfly.networks.matching import cell_pixels
 
 STEPS = 40
-
-
-@contextmanager
-def bar(step: str, what: str):  # type: ignore[no-untyped-def]
-    yield lambda done, total: None
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,10 @@ import pytest
 from overfly.errors import InputError
 from overfly.geometry import Camera, invert, unproject
 from overfly.mapping.consensus import consensus
+from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.fuse import fuse
 from overfly.mapping.neighbours import choose_partners
-from overfly.mapping.stereo import depth_ranges, stereo
+from overfly.mapping.stereo import stereo
 from overfly.mapping.subpixel import Shot, frame_to_frame, refine
 
 GSD = 80 / 320

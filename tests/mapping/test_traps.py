@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from conftest import ORIGIN, nadir
+from conftest import ORIGIN, bar, nadir
 from overfly.flights import Flight, Gps
 from overfly.geodesy import enu_from_geodetic, geodetic_from_enu
 from overfly.geometry import fit_similarity, transform
 from overfly.mapping.align import align
 
-
-@contextmanager
-def bar(step: str, what: str):  # type: ignore[no-untyped-def]
-    yield lambda done, total: None
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_features():  # type: ignore[no-untyped-def]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("overfly.mapping.features.FEATURES", 1200)
-        yield
+pytestmark = pytest.mark.usefixtures("few_features")
 
 
 @pytest.fixture(scope="module")

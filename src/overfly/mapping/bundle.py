@@ -156,7 +156,7 @@ def merged(parts: Sequence[Bundle]) -> Bundle:
         lenses=lenses,
         lens_ids=lens_ids,
         points=np.concatenate([part.points for part in parts]),
-        image=rank[np.concatenate([part.image + start for part, start in zip(parts, starts, strict=False)])],
-        point=np.concatenate([part.point + end for part, end in zip(parts, ends, strict=False)]),
+        image=rank[np.concatenate([part.image + start for part, start in zip(parts, starts[:-1], strict=True)])],
+        point=np.concatenate([part.point + end for part, end in zip(parts, ends[:-1], strict=True)]),
         pixels=np.concatenate([part.pixels for part in parts]),
     )

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from overfly.flights import Frame
+from overfly.geometry import Array
 from overfly.mapping.adjustment import LENS_SIGMA, Adjusted, Held, adjusted, free
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.database import focal_px
@@ -43,11 +44,10 @@ ROUGHLY = 1.0
 def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
     """What the images and the photos' own data say of a bundle: the weights of its rays, priors of its cameras."""
     own = [frames[i] for i in bundle.frames]
-    shrunk = np.array([max(1.0, max(frame.width, frame.height) / LONGEST_SIDE) for frame in own])
     count = np.bincount(bundle.lens_of, minlength=len(bundle.lenses))
     focals = [focal_px(own[int(np.flatnonzero(bundle.lens_of == j)[0])]) or np.nan for j in range(len(count))]
     return replace(
-        free(bundle, NOISE_PX * shrunk[bundle.image]),
+        free(bundle, NOISE_PX * _shrunk(bundle, frames)),
         focals=np.array(focals, float),
         focal_sigma=FOCAL_SIGMA,
         lens_sigma=NO_LENS_SIGMA,
@@ -60,21 +60,22 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
     # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
     loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
     result = adjusted(bundle, loose, tolerance=ROUGHLY)
-    shrunk = np.array([max(1.0, max(frames[i].width, frames[i].height) / LONGEST_SIDE) for i in bundle.frames])
-    good = result.bundle.errors() <= WORST_PX * shrunk[bundle.image]
-    kept = result.bundle.kept(good)
+    kept = result.bundle.kept(result.bundle.errors() <= WORST_PX * _shrunk(bundle, frames))
+    images = free(kept, NOISE_PX * _shrunk(kept, frames))
     again = replace(
-        free(kept, NOISE_PX * shrunk[kept.image]),
-        places=held.places,
+        held,
+        pixel_sigma=images.pixel_sigma,
+        knows=images.knows,
+        know_sigmas=images.know_sigmas,
         place_sigmas=widened(held.place_sigmas, result.away()),
-        ups=held.ups,
-        focals=held.focals,
-        focal_sigma=held.focal_sigma,
-        lens_sigma=held.lens_sigma,
-        lens_fixed=held.lens_fixed,
-        lever=held.lever,
     )
     return adjusted(kept, again, lever=result.lever, tolerance=ROUGHLY)
+
+
+def _shrunk(bundle: Bundle, frames: Sequence[Frame]) -> Array:
+    """Pixels of its image in a pixel of the picture that was searched, for each ray [k]."""
+    shrunk = [max(1.0, max(frames[i].width, frames[i].height) / LONGEST_SIDE) for i in bundle.frames]
+    return np.array(shrunk)[bundle.image]
 
 
 def calibrated(result: Adjusted, drifted: bool) -> Adjusted:

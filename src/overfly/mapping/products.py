@@ -104,7 +104,7 @@ def raster_products(
             _draw(cloud, grid, fill, window, heights, None)
         if painter is not None:
             parts = max(1, round(grid.cell / gsd))
-            _paint(heights, grid, painter, grid.cell / parts, photo, few.epsg, parts * window)
+            _paint(heights, grid, painter, grid.cell / parts, photo, few.epsg, window)
     return grid
 
 

@@ -8,9 +8,8 @@ frames at a time whatever the size of the flight.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +18,16 @@ from numpy.typing import NDArray
 from overfly.errors import Damaged, InputError
 from overfly.files import UNREADABLE, load_arrays, save_arrays
 from overfly.flights import Frame
-from overfly.geometry import Array, Camera, project, unproject
+from overfly.geometry import Array, Camera, unproject
 from overfly.mapping.coarse import coarse_points
 from overfly.mapping.consensus import consensus
-from overfly.mapping.culling import Groups
 from overfly.mapping.depth_map import DepthMap, Map, Opinion
+from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.neighbours import choose_partners
 from overfly.mapping.rectify import Rectified, ordered, rectify
 from overfly.mapping.subpixel import refine
+from overfly.mapping.threads import in_threads
 from overfly.mapping.views import Views
 
 Opinions = Callable[[int, list[int], Array], Opinion | None]
@@ -38,17 +38,14 @@ BASE_TO_HEIGHT = (0.04, 0.9)
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels of the matched (half) size."""
 
+REFINED_SIGMA = 0.25
+"""The same after refinement, pixels of the full size."""
+
 SURE = 0.6
 """Correlation from which on a refined depth is taken for measured before any other frame confirms it."""
 
-BESIDE = 24
-"""Nearest frames that tell the usual depths where a frame's own are not known."""
-
 AHEAD = 2
 """Frames that are begun for each worker before the first of them is finished."""
-
-REFINED_SIGMA = 0.25
-"""The same after refinement, pixels of the full size."""
 
 
 def stereo(
@@ -141,31 +138,6 @@ def stereo(
     ]
 
 
-@contextmanager
-def in_threads(workers: int) -> Iterator[Executor]:
-    """A pool of threads, each of which computes on one core: more threads below them would only get in their way.
-
-    What waits is dropped when the block ends early.
-    """
-    import cv2
-    import torch
-
-    before = cv2.getNumThreads(), torch.get_num_threads()
-
-    def alone() -> None:
-        if workers > 1:
-            cv2.setNumThreads(1)
-            torch.set_num_threads(1)
-
-    pool = ThreadPoolExecutor(max_workers=workers, initializer=alone)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-        cv2.setNumThreads(before[0])
-        torch.set_num_threads(before[1])
-
-
 def _drop_damaged(workdir: Path) -> None:
     """Remove what an earlier run left that cannot be read: it is made again."""
     for path in workdir.glob("depth-*.npz"):
@@ -179,41 +151,6 @@ def _drop_damaged(workdir: Path) -> None:
                 np.load(file)
         except UNREADABLE:
             path.unlink()
-
-
-def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[tuple[float, float, float]]:
-    """Nearest, median and farthest depth of each frame's surface, with margins, from surface points [M, 3].
-
-    Frames with too few points inside them take the usual depths of the frames beside them.
-    """
-    groups = Groups(points)
-    found: list[tuple[float, float, float] | None] = []
-    for camera, pose in zip(cameras, poses):
-        pixels, depth = project(groups.points[groups.near(camera, pose)], camera, pose)
-        with np.errstate(invalid="ignore"):
-            inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
-        if inside.sum() < 20:
-            found.append(None)
-            continue
-        low, middle, high = np.quantile(depth[inside], [0.005, 0.5, 0.995])
-        # Roofs and tree tops have few key points: leave room above.
-        margin = 0.15 * (high - low) + 0.02 * middle
-        found.append((max(low - 1.5 * margin, 0.05 * middle), float(middle), float(high + margin)))
-    known = np.flatnonzero([f is not None for f in found])
-    if not len(known):
-        raise InputError(
-            "The surface points lie outside all frames: the cameras and the points do not belong together."
-        )
-    centres = np.array([pose[:3, 3] for pose in poses])
-    ranges = np.array([f for f in found if f is not None])
-    settled = []
-    for i, own in enumerate(found):
-        if own is None:
-            away = np.linalg.norm(centres[known] - centres[i], axis=1)
-            low, middle, high = np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0)
-            own = (float(low), float(middle), float(high))
-        settled.append(own)
-    return settled
 
 
 def _sample(depth: Map, camera: Camera, world_from_camera: Array, step: int = 8) -> Array:

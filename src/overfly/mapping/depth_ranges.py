@@ -1,0 +1,49 @@
+"""How near and how far the surface lies from each frame, by surface points: the range that pairs are matched in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from overfly.errors import InputError
+from overfly.geometry import Array, Camera, project
+from overfly.mapping.culling import Groups
+
+BESIDE = 24
+"""Nearest frames that tell the usual depths where a frame's own are not known."""
+
+
+def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[tuple[float, float, float]]:
+    """Nearest, median and farthest depth of each frame's surface, with margins, from surface points [M, 3].
+
+    Frames with too few points inside them take the usual depths of the frames beside them.
+    """
+    groups = Groups(points)
+    found: list[tuple[float, float, float] | None] = []
+    for camera, pose in zip(cameras, poses):
+        pixels, depth = project(groups.points[groups.near(camera, pose)], camera, pose)
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
+        if inside.sum() < 20:
+            found.append(None)
+            continue
+        low, middle, high = np.quantile(depth[inside], [0.005, 0.5, 0.995])
+        # Roofs and tree tops have few key points: leave room above.
+        margin = 0.15 * (high - low) + 0.02 * middle
+        found.append((max(low - 1.5 * margin, 0.05 * middle), float(middle), float(high + margin)))
+    known = np.flatnonzero([f is not None for f in found])
+    if not len(known):
+        raise InputError(
+            "The surface points lie outside all frames: the cameras and the points do not belong together."
+        )
+    centres = np.array([pose[:3, 3] for pose in poses])
+    ranges = np.array([f for f in found if f is not None])
+    settled = []
+    for i, own in enumerate(found):
+        if own is None:
+            away = np.linalg.norm(centres[known] - centres[i], axis=1)
+            low, middle, high = np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0)
+            own = (float(low), float(middle), float(high))
+        settled.append(own)
+    return settled
