@@ -85,13 +85,13 @@ def align(
             )
         numbers = {name: i for i, name in enumerate(names)}
         parts = [bundle_of(model, numbers) for model in models]
-        drifted = focal_drift(parts[0], flight.frames) > FOCAL_SUSPECT
-        if drifted:
+        drift = focal_drift(parts[0], flight.frames)
+        if drift > FOCAL_SUSPECT:
             # Over flat ground a focal length without limits may run away, and everything with it.
             models = mapped(database, flight.root, workdir / "held", names=names, seed=seed, calibrate=False)
             held = [bundle_of(model, numbers) for model in models]
             parts = held if held and len(held[0]) >= len(parts[0]) else parts
-        block = _held_block(flight, parts, origin, told, control, warnings, seed, drifted)
+        block = _held_block(flight, parts, origin, told, control, warnings, seed, drift)
         update(2, 2)
     return block
 
@@ -121,7 +121,7 @@ def _held_block(
     control: str,
     warnings: list[str],
     seed: int,
-    drifted: bool,
+    drift: float,
 ) -> Block:
     """The adjusted block, by what there is: GPS and controls, either, or the ground alone."""
     at = None
@@ -145,7 +145,8 @@ def _held_block(
         bundle = parts[0]
         # A scale near metres: the unit of a sparse model is arbitrary.
         result = adjusted_twice(bundle, held_by_images(bundle, flight.frames), flight.frames)
-    result = calibrated(result, drifted)
+    result = calibrated(result, drift > FOCAL_SUSPECT)
+    unsure = drift if focal_drift(result.bundle, flight.frames) < FOCAL_SUSPECT < drift else 0.0
     ruled: Controlled | None = None
     if flight.gcps and control != "none":
         if at is None and (origin := control_origin(flight.gcps)) is not None:
@@ -161,6 +162,12 @@ def _held_block(
         bundle = result.bundle
         lift = by_ground(bundle.centres, bundle.points, bundle.world_from_camera, seed)
         result = replace(result, bundle=bundle.moved(lift))
+    if unsure and not (ruled is not None and ruled.used):
+        warnings.append(
+            f"The focal length is that of the photos' data: by the images alone it would be {100 * unsure:.0f} % off, "
+            "and they do not clearly tell which is right. Differences in height may be wrong by as much: use ground "
+            "control, add images from another height, or give a calibrated camera."
+        )
     _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
     return _block(result, flight.frames, origin, metric, ruled, at is not None, apart, warnings)
 
