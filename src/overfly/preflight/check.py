@@ -12,6 +12,7 @@ import numpy as np
 
 from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
+from overfly.geometry import Array
 from overfly.mapping.needs import core_seconds, memory_gb
 from overfly.mapping.report import duration, length_text
 from overfly.preflight.accuracy import SIGMA_PX
@@ -23,6 +24,7 @@ from overfly.preflight.images import Look, look_at_all
 from overfly.preflight.overlap import overlap_findings
 from overfly.preflight.positions import position_findings
 from overfly.preflight.quality import camera_findings, image_findings, relative_sharpness
+from overfly.preflight.registration import facing, placed_chances, usable_shares
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -41,6 +43,7 @@ class Check:
         gaps: ground that needs more lines.
         findings: worst first.
         motion_px: way of the drone during an exposure, pixels on the ground.
+        chances: of each image to be placed with the others [n], see :mod:`overfly.preflight.registration`.
     """
 
     flight: Flight
@@ -50,6 +53,7 @@ class Check:
     gaps: list[Gap]
     findings: list[Finding]
     motion_px: float | None
+    chances: Array
 
     @property
     def mappable(self) -> bool:
@@ -79,6 +83,7 @@ class Check:
             "overlap": None if self.placed is None or self.seen is None else _overlap(self.placed, self.seen),
             "gaps": [gap.to_dict(self.placed.origin if self.placed is not None else None) for gap in self.gaps],
             "motion_px": _round(self.motion_px),
+            "expected_placed": _round(float(self.chances.mean())),
             "estimate": {"core_seconds": round(core_seconds(sizes)), "memory_gb": round(memory_gb(sizes), 2)},
             "findings": [finding.to_dict() for finding in self.findings],
         }
@@ -86,12 +91,13 @@ class Check:
             {
                 "name": frame.name,
                 "sharpness": _round(sharpness),
+                "expected_placed": _round(chance),
                 "brightness": _round(look.brightness),
                 "dark": _round(look.dark),
                 "bright": _round(look.bright),
                 "flat": _round(look.flat),
             }
-            for frame, look, sharpness in zip(self.flight.frames, self.looks, sharp, strict=True)
+            for frame, look, sharpness, chance in zip(self.flight.frames, self.looks, sharp, self.chances, strict=True)
         ]
         return result
 
@@ -126,6 +132,7 @@ class Check:
                 ("expected sigma in height", _length(self.seen.sigma_z_m, self.placed.metric)),
                 ("expected sigma in plan", _length(self.seen.sigma_xy_m, self.placed.metric)),
             ]
+        rows.append(("images that will be placed (expected)", f"{self.chances.sum():.0f} of {len(self.flight)}"))
         if self.motion_px is not None:
             rows.append(("motion during an exposure", f"{self.motion_px:.1f} px"))
         sharp = relative_sharpness(self.flight, self.looks)
@@ -216,7 +223,12 @@ def check_flight(
             )
         )
     findings += [*image_findings(flight, looks, motion), *camera_findings(flight), *_told(flight)]
-    return Check(flight, looks, placed, seen, gaps, ranked(findings), motion)
+    usable = usable_shares(looks, relative_sharpness(flight, looks))
+    names, where, shared = [f.name for f in flight.frames], [], None
+    if placed is not None and seen is not None:
+        where, shared = [f.name for f in placed.frames], seen.overlaps * facing(placed.poses[:, :3, 2])
+    chances = placed_chances(names, usable, where, shared)
+    return Check(flight, looks, placed, seen, gaps, ranked(findings), motion, chances)
 
 
 def _told(flight: Flight) -> list[Finding]:

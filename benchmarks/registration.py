@@ -1,0 +1,211 @@
+"""Does ``overfly check`` foretell what can be mapped, and does it name what was done to a flight?
+
+    python benchmarks/registration.py --out outputs/registration
+
+Rendered flights with GPS noise, some of them spoilt (little overlap, missing frames, blur, faded or black pictures) are
+checked, then their cameras are estimated. AUC: of expected shares of placed images against flights of which at least
+95 % were placed. Then eight faults are injected into good flights, each by itself: a check is right if the worst
+finding that the untouched flight does not have names the cause. Finished flights are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageFilter
+
+from overfly.errors import InputError
+from overfly.files import replacing
+from overfly.flights import fly
+from overfly.mapping.map import align_flight
+from overfly.preflight.check import check_flight
+from overfly.tables import markdown
+
+STYLES = ("campus", "blocks", "suburb", "industrial", "village", "vegetation")
+PLACED = 0.95
+Change = Callable[[Image.Image], Image.Image]
+
+
+def rewrite(path: Path, change: Change) -> None:
+    """Change the pixels of a photograph, not its metadata."""
+    with Image.open(path) as image:
+        exif, xmp = image.info["exif"], image.info["xmp"]
+        changed = change(image.convert("RGB"))
+    with replacing(path) as temporary:
+        changed.save(temporary, "JPEG", quality=95, subsampling=0, exif=exif, xmp=xmp)
+
+
+def blur(radius: float) -> Change:
+    return lambda image: image.filter(ImageFilter.GaussianBlur(radius))
+
+
+def scaled(factor: float, towards: float, seed: int) -> Change:
+    """Grey values drawn towards one value, below a sensor's noise: fog and snow, or night."""
+
+    def change(image: Image.Image) -> Image.Image:
+        noise = np.random.default_rng(seed).normal(size=(image.height, image.width, 3))
+        values = towards + factor * (np.asarray(image, float) - towards) + noise
+        return Image.fromarray(np.clip(values, 0, 255).astype(np.uint8))
+
+    return change
+
+
+def flight_of(out: Path, style: str, seed: int, path: str, overlap: float, frames: int = 12) -> list[Path]:
+    """The photographs of a rendered flight, without the cameras beside them."""
+    fly(style, out=out / "full", flight_path=path, overlap=overlap, side_overlap=max(overlap, 15), altitude=120,
+        width=480, height=360, frames=frames, seed=seed, noise="gps", reference_points=0)  # fmt: skip
+    shutil.rmtree(out / "photos", ignore_errors=True)
+    shutil.copytree(out / "full" / "images", out / "photos")
+    return sorted((out / "photos").iterdir())
+
+
+def spoil(photos: list[Path], rng: np.random.Generator) -> str:
+    """Do one thing to a flight; returns what."""
+    kind = str(rng.choice(["nothing", "nothing", "blur", "fade", "dark", "missing"]))
+    chosen = [p for p in photos if rng.random() < rng.choice([0.3, 0.6, 1.0])]
+    strength = float(rng.uniform())
+    for k, path in enumerate(chosen if kind != "nothing" else []):
+        if kind == "blur":
+            rewrite(path, blur(1 + 5 * strength))
+        elif kind == "fade":
+            rewrite(path, scaled(0.01 + 0.2 * strength**2, 200, k))
+        elif kind == "dark":
+            rewrite(path, scaled(0.005 + 0.1 * strength**2, 0, k))
+        elif len(chosen) < len(photos) - 2:
+            path.unlink()
+    return f"{kind} {strength:.2f} of {len(chosen)}" if kind != "nothing" else kind
+
+
+def outcome(out: Path, number: int) -> dict[str, Any]:
+    """Check and placement of one flight: kept, or made."""
+    kept = out / f"flight-{number:03d}.json"
+    if kept.is_file():
+        row: dict[str, Any] = json.loads(kept.read_text())
+        return row
+    rng = np.random.default_rng([7, number])
+    style, path = STYLES[number % len(STYLES)], str(rng.choice(["grid", "grid", "circular"]))
+    overlap = float(rng.choice([10, 15, 20, 25, 30, 40, 50, 60, 75]))
+    folder = out / f"flight-{number:03d}"
+    photos = flight_of(folder, style, 2000 + number, path, overlap)
+    done = spoil(photos, rng)
+    count = len(list((folder / "photos").iterdir()))
+    check = check_flight(folder / "photos")
+    try:
+        _, block = align_flight(
+            folder / "photos", out=folder / "map", cameras="estimate", dense="stereo", progress=False
+        )
+        placed = (len(block.frames) - len(block.held_by_gps)) / count
+    except InputError:
+        placed = 0.0
+    row = {"style": style, "path": path, "overlap": overlap, "done": done, "images": count, "placed": placed}
+    row["expected"] = float(check.chances.mean())
+    row["verdict"] = check.verdict
+    kept.write_text(json.dumps(row) + "\n")
+    shutil.rmtree(folder)
+    return row
+
+
+def auc(scores: np.ndarray, good: np.ndarray) -> float:
+    """The chance that a good flight has a higher score than a bad one; ties count half."""
+    above = scores[good][:, None] - scores[~good]
+    return float((above > 0).mean() + 0.5 * (above == 0).mean())
+
+
+def faults(photos: list[Path]) -> dict[str, Callable[[], None]]:
+    """Topic of the finding -> what brings it about."""
+    middle = photos[len(photos) // 2]
+    few = photos[2::5]
+
+    def copies() -> None:
+        for path in few:
+            shutil.copy(path, path.with_name(f"{path.stem}_copy.jpg"))
+
+    def displaced() -> None:
+        from overfly.flights import read_flight
+
+        frames = read_flight(photos[0].parent).frames
+        lines = ["EPSG:4326"]
+        for frame in frames:
+            assert frame.gps is not None
+            off = 4e-4 if frame.name == middle.name else 0.0  # 44 m
+            lines.append(f"{frame.name} {frame.gps.longitude:.8f} {frame.gps.latitude + off:.8f} {frame.gps.altitude}")
+        (photos[0].parent / "geo.txt").write_text("\n".join(lines) + "\n")
+
+    def every(change: Change) -> Callable[[], None]:
+        return lambda: [rewrite(path, change) for path in few] and None
+
+    def halved() -> None:
+        for path in photos[1::2]:
+            path.unlink()
+
+    def zoomed() -> None:
+        for path in few:
+            rewrite(path, lambda image: image.crop((40, 30, image.width - 40, image.height - 30)))
+
+    return {
+        "blur": every(blur(3)),
+        "exposure": every(scaled(3.0, 0, 0)),
+        "texture": every(scaled(0.01, 180, 0)),
+        "duplicates": copies,
+        "gps": displaced,
+        "files": lambda: (middle.write_bytes(middle.read_bytes()[:3000]), None)[1],
+        "overlap": halved,
+        "cameras": zoomed,
+    }
+
+
+def named(out: Path, number: int) -> dict[str, bool]:
+    """For each fault, whether the check of a good flight with it names it."""
+    kept = out / f"faults-{number:03d}.json"
+    if kept.is_file():
+        found: dict[str, bool] = json.loads(kept.read_text())
+        return found
+    folder, result = out / f"faults-{number:03d}", {}
+    style = STYLES[number % len(STYLES)]
+    usual = None
+    for topic in faults([Path("a")] * 9):
+        photos = flight_of(folder, style, 3000 + number, "grid", 65, frames=20)
+        if usual is None:
+            usual = {(finding.topic, finding.level) for finding in check_flight(folder / "photos").findings}
+        faults(photos)[topic]()
+        findings = check_flight(folder / "photos").findings
+        new = [finding for finding in findings if (finding.topic, finding.level) not in usual]
+        result[topic] = bool(new) and new[0].topic in ({topic} | ({"gaps"} if topic == "overlap" else set()))
+        if not result[topic]:
+            print(style, topic, [str(finding) for finding in new])
+    kept.write_text(json.dumps(result) + "\n")
+    shutil.rmtree(folder)
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("outputs/registration"))
+    parser.add_argument("--flights", type=int, default=60)
+    parser.add_argument("--first", type=int, default=0, help="number of the first flight: other flights, another test")
+    parser.add_argument("--faulty", type=int, default=6, help="good flights into which the faults are injected")
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+    rows = [outcome(asked.out, number) for number in range(asked.first, asked.first + asked.flights)]
+    right = [named(asked.out, number) for number in range(asked.faulty)]
+    print(markdown(rows))
+    if rows:
+        good = np.array([row["placed"] >= PLACED for row in rows])
+        expected = np.array([row["expected"] for row in rows])
+        off = np.abs(expected - [row["placed"] for row in rows])
+        print(f"\n{good.sum()} of {len(good)} flights placed; AUC {auc(expected, good):.3f}")
+        print(f"Mean error of the expected share: {off.mean():.3f}")
+
+    if right:
+        shares = {topic: f"{sum(r[topic] for r in right)} of {len(right)}" for topic in right[0]}
+        print(f"Named causes: {shares}; {np.mean([list(r.values()) for r in right]):.0%} right")
+
+
+if __name__ == "__main__":
+    main()
