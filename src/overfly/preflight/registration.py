@@ -19,7 +19,7 @@ HALF_LINKED, SOFTNESS = 0.22, 0.03
 by hand; ``benchmarks/registration.py`` measures what comes of it."""
 
 
-FACING_DEG, APART_DEG = 20.0, 45.0
+FACING_DEG, APART_DEG = 15.0, 35.0
 """Between views that differ by less than the first, overlap alone decides; by more than the second nothing matches."""
 
 
