@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any, ClassVar
 
 import torch
@@ -37,16 +38,6 @@ class CloudMetric(Metric):
         for name in self._names:
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
-    def update(self, predicted: Tensor, target: Tensor, *, scale: Tensor | None = None) -> None:
-        """Add a batch of pairs."""
-        found = self._distances(predicted, target)
-        factors = _per_pair(scale, "scale", len(found))
-        self._add([self.value(d if f is None else d.scaled(f)) for d, f in zip(found, factors, strict=True)])
-
-    def value(self, found: Distances) -> float:
-        """The value of one pair, from its distances in metres."""
-        raise NotImplementedError
-
     def compute(self) -> Tensor:
         """The mean over all pairs so far; NaN before the first."""
         total, count = (getattr(self, name) for name in self._names)
@@ -72,6 +63,20 @@ class CloudMetric(Metric):
             found = [distances(p, t) for p, t in zip(predicted, target)]
             last = CloudMetric._last = ([points.detach().clone() for points in batch], found)
         return last[1]
+
+
+class LengthMetric(CloudMetric):
+    """A cloud metric whose value follows from the distances alone."""
+
+    def update(self, predicted: Tensor, target: Tensor, *, scale: Tensor | None = None) -> None:
+        """Add a batch of pairs."""
+        found = self._distances(predicted, target)
+        factors = _per_pair(scale, "scale", len(found))
+        self._add([self.value(d if f is None else d.scaled(f)) for d, f in zip(found, factors, strict=True)])
+
+    @abstractmethod
+    def value(self, found: Distances) -> float:
+        """The value of one pair, from its distances in metres."""
 
 
 def _same(a: Tensor, b: Tensor) -> bool:

@@ -6,11 +6,11 @@ from typing import Any
 
 from torch import Tensor
 
-from overfly.metrics.base import CloudMetric
+from overfly.metrics.base import CloudMetric, LengthMetric
 from overfly.metrics.functional import PAPER_POINTS, Distances, chamfer_sum, subset
 
 
-class ChamferM2(CloudMetric):
+class ChamferM2(LengthMetric):
     """Mean squared distance to the nearest neighbour, both directions added; square metres (PyTorch3D's)."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -20,7 +20,7 @@ class ChamferM2(CloudMetric):
         return found.chamfer_m2
 
 
-class ChamferM(CloudMetric):
+class ChamferM(LengthMetric):
     """Mean distance to the nearest neighbour, both directions added; metres (Open3D's, point-cloud-utils')."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -41,7 +41,7 @@ class ChamferSum1024(CloudMetric):
         super().__init__("chamfer_sum_1024", **kwargs)
         self.seed = seed
 
-    def update(self, predicted: Tensor, target: Tensor) -> None:  # type: ignore[override]
+    def update(self, predicted: Tensor, target: Tensor) -> None:
         """Add a batch of pairs; there is no scale, because the paper's frame has none."""
         start = self.pairs
         self._add([chamfer_sum_1024(p, t, self.seed, start + i) for i, (p, t) in enumerate(zip(predicted, target))])

@@ -40,7 +40,7 @@ class EmdSum1024(CloudMetric):
         super().__init__("emd_sum_1024", **kwargs)
         self.seed = seed
 
-    def update(self, predicted: Tensor, target: Tensor) -> None:  # type: ignore[override]
+    def update(self, predicted: Tensor, target: Tensor) -> None:
         """Add a batch of pairs; there is no scale, because the paper's frame has none."""
         start = self.pairs
         values = [

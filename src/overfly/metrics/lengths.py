@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from overfly.errors import InputError
-from overfly.metrics.base import CloudMetric
+from overfly.metrics.base import LengthMetric
 from overfly.metrics.functional import Distances
 
 
-class _Quantile(CloudMetric):
+class _Quantile(LengthMetric):
     """A quantile of the distances of each pair (default: the median), averaged over the pairs; metres."""
 
     name: str
@@ -40,7 +40,7 @@ class Completeness(_Quantile):
         return found.completeness_m(self.quantile)
 
 
-class HausdorffM(CloudMetric):
+class HausdorffM(LengthMetric):
     """The largest distance from a point of either cloud to the other, averaged over the pairs; metres."""
 
     def __init__(self, **kwargs: Any) -> None:

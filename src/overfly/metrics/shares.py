@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any
 
 from torch import Tensor
@@ -44,8 +45,9 @@ class _Share(CloudMetric):
             values.append(self.share(distances if factor is None else distances.scaled(factor), limit))
         self._add(values)
 
+    @abstractmethod
     def share(self, found: Distances, threshold_m: float) -> float:
-        raise NotImplementedError
+        """The share of one pair, from its distances, at a threshold in metres."""
 
 
 def _label(threshold: float, unit: str) -> str:
