@@ -5,7 +5,7 @@
 Rendered flights with GPS noise, some of them spoilt (little overlap, missing frames, blur, faded or black pictures) are
 checked, then their cameras are estimated. AUC: of expected shares of placed images against flights of which at least
 95 % were placed. Then eight faults are injected into good flights, each by itself: a check is right if the worst
-finding that the untouched flight does not have names the cause. Finished flights are kept.
+finding that the untouched flight does not have names the cause. Photographs and placements are kept.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 from PIL import Image, ImageFilter
+from scipy.stats import mannwhitneyu
 
 from overfly.errors import InputError
 from overfly.files import replacing
-from overfly.flights import fly
+from overfly.flights import fly, read_flight
 from overfly.mapping.map import align_flight
 from overfly.preflight.check import check_flight
 from overfly.tables import markdown
@@ -83,104 +84,76 @@ def spoil(photos: list[Path], rng: np.random.Generator) -> str:
 
 
 def outcome(out: Path, number: int) -> dict[str, Any]:
-    """Check and placement of one flight: kept, or made."""
-    kept = out / f"flight-{number:03d}.json"
-    if kept.is_file():
-        row: dict[str, Any] = json.loads(kept.read_text())
-        return row
-    rng = np.random.default_rng([7, number])
-    style, path = STYLES[number % len(STYLES)], str(rng.choice(["grid", "grid", "circular"]))
-    overlap = float(rng.choice([10, 15, 20, 25, 30, 40, 50, 60, 75]))
-    folder = out / f"flight-{number:03d}"
-    photos = flight_of(folder, style, 2000 + number, path, overlap)
-    done = spoil(photos, rng)
-    count = len(list((folder / "photos").iterdir()))
+    """Check and placement of one flight; photographs and placement are kept, the check is always made anew."""
+    folder, kept = out / f"flight-{number:03d}", out / f"flight-{number:03d}.json"
+    if not kept.is_file():
+        rng = np.random.default_rng([7, number])
+        style, path = STYLES[number % len(STYLES)], str(rng.choice(["grid", "grid", "circular"]))
+        overlap = float(rng.choice([10, 15, 20, 25, 30, 40, 50, 60, 75]))
+        photos = flight_of(folder, style, 2000 + number, path, overlap)
+        row: dict[str, Any] = {"style": style, "path": path, "overlap": overlap, "done": spoil(photos, rng)}
+        count = len(list((folder / "photos").iterdir()))
+        try:
+            _, block = align_flight(
+                folder / "photos", out=folder / "map", cameras="estimate", dense="stereo", progress=False
+            )
+            row |= {"images": count, "placed": (len(block.frames) - len(block.held_by_gps)) / count, "why": ""}
+        except InputError as error:
+            row |= {"images": count, "placed": 0.0, "why": str(error).split(":")[0]}
+        shutil.rmtree(folder / "map", ignore_errors=True)
+        kept.write_text(json.dumps(row) + "\n")
     check = check_flight(folder / "photos")
-    try:
-        _, block = align_flight(
-            folder / "photos", out=folder / "map", cameras="estimate", dense="stereo", progress=False
-        )
-        placed = (len(block.frames) - len(block.held_by_gps)) / count
-    except InputError:
-        placed = 0.0
-    row = {"style": style, "path": path, "overlap": overlap, "done": done, "images": count, "placed": placed}
-    row["expected"] = float(check.chances.mean())
-    row["verdict"] = check.verdict
-    kept.write_text(json.dumps(row) + "\n")
-    shutil.rmtree(folder)
-    return row
+    return {**json.loads(kept.read_text()), "expected": float(check.chances.mean()), "verdict": check.verdict}
 
 
 def auc(scores: np.ndarray, good: np.ndarray) -> float:
     """The chance that a good flight has a higher score than a bad one; ties count half."""
-    above = scores[good][:, None] - scores[~good]
-    return float((above > 0).mean() + 0.5 * (above == 0).mean())
+    return float(mannwhitneyu(scores[good], scores[~good]).statistic / (good.sum() * (~good).sum()))
 
 
-def faults(photos: list[Path]) -> dict[str, Callable[[], None]]:
-    """Topic of the finding -> what brings it about."""
-    middle = photos[len(photos) // 2]
-    few = photos[2::5]
+FAULTS = ("blur", "exposure", "texture", "duplicates", "gps", "files", "overlap", "cameras")
+"""Topics of the findings that name them."""
 
-    def copies() -> None:
+
+def inject(fault: str, photos: list[Path]) -> None:
+    """Bring one fault about in a flight."""
+    middle, few = photos[len(photos) // 2], photos[2::5]
+    pixels = {"blur": blur(3), "exposure": scaled(3.0, 0, 0), "texture": scaled(0.01, 180, 0)}
+    pixels["cameras"] = lambda image: image.crop((40, 30, image.width - 40, image.height - 30))
+    if fault in pixels:
+        for path in few:
+            rewrite(path, pixels[fault])
+    elif fault == "duplicates":
         for path in few:
             shutil.copy(path, path.with_name(f"{path.stem}_copy.jpg"))
-
-    def displaced() -> None:
-        from overfly.flights import read_flight
-
-        frames = read_flight(photos[0].parent).frames
-        lines = ["EPSG:4326"]
-        for frame in frames:
-            assert frame.gps is not None
-            off = 4e-4 if frame.name == middle.name else 0.0  # 44 m
-            lines.append(f"{frame.name} {frame.gps.longitude:.8f} {frame.gps.latitude + off:.8f} {frame.gps.altitude}")
-        (photos[0].parent / "geo.txt").write_text("\n".join(lines) + "\n")
-
-    def every(change: Change) -> Callable[[], None]:
-        return lambda: [rewrite(path, change) for path in few] and None
-
-    def halved() -> None:
+    elif fault == "files":
+        middle.write_bytes(middle.read_bytes()[:3000])
+    elif fault == "overlap":
         for path in photos[1::2]:
             path.unlink()
-
-    def zoomed() -> None:
-        for path in few:
-            rewrite(path, lambda image: image.crop((40, 30, image.width - 40, image.height - 30)))
-
-    return {
-        "blur": every(blur(3)),
-        "exposure": every(scaled(3.0, 0, 0)),
-        "texture": every(scaled(0.01, 180, 0)),
-        "duplicates": copies,
-        "gps": displaced,
-        "files": lambda: (middle.write_bytes(middle.read_bytes()[:3000]), None)[1],
-        "overlap": halved,
-        "cameras": zoomed,
-    }
+    else:
+        lines = ["EPSG:4326"]
+        for frame in read_flight(photos[0].parent).frames:
+            assert frame.gps is not None
+            north = frame.gps.latitude + (4e-4 if frame.name == middle.name else 0.0)  # 44 m
+            lines.append(f"{frame.name} {frame.gps.longitude:.8f} {north:.8f} {frame.gps.altitude}")
+        (photos[0].parent / "geo.txt").write_text("\n".join(lines) + "\n")
 
 
 def named(out: Path, number: int) -> dict[str, bool]:
-    """For each fault, whether the check of a good flight with it names it."""
-    kept = out / f"faults-{number:03d}.json"
-    if kept.is_file():
-        found: dict[str, bool] = json.loads(kept.read_text())
-        return found
+    """For each fault, whether the check of a good flight with it names it before all that is new."""
     folder, result = out / f"faults-{number:03d}", {}
     style = STYLES[number % len(STYLES)]
-    usual = None
-    for topic in faults([Path("a")] * 9):
-        photos = flight_of(folder, style, 3000 + number, "grid", 65, frames=20)
-        if usual is None:
-            usual = {(finding.topic, finding.level) for finding in check_flight(folder / "photos").findings}
-        faults(photos)[topic]()
+    flight_of(folder, style, 3000 + number, "grid", 65, frames=20)
+    usual = {(finding.topic, finding.level) for finding in check_flight(folder / "photos").findings}
+    for fault in FAULTS:
+        inject(fault, flight_of(folder, style, 3000 + number, "grid", 65, frames=20))
         findings = check_flight(folder / "photos").findings
         new = [finding for finding in findings if (finding.topic, finding.level) not in usual]
-        result[topic] = bool(new) and new[0].topic in ({topic} | ({"gaps"} if topic == "overlap" else set()))
-        if not result[topic]:
-            print(style, topic, [str(finding) for finding in new])
-    kept.write_text(json.dumps(result) + "\n")
-    shutil.rmtree(folder)
+        # Missing images are gaps as well as too little overlap.
+        result[fault] = bool(new) and new[0].topic in {fault, "gaps" if fault == "overlap" else fault}
+        if not result[fault]:
+            print(style, fault, [str(finding) for finding in new])
     return result
 
 
@@ -201,7 +174,6 @@ def main() -> None:
         off = np.abs(expected - [row["placed"] for row in rows])
         print(f"\n{good.sum()} of {len(good)} flights placed; AUC {auc(expected, good):.3f}")
         print(f"Mean error of the expected share: {off.mean():.3f}")
-
     if right:
         shares = {topic: f"{sum(r[topic] for r in right)} of {len(right)}" for topic in right[0]}
         print(f"Named causes: {shares}; {np.mean([list(r.values()) for r in right]):.0%} right")

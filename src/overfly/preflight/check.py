@@ -132,7 +132,8 @@ class Check:
                 ("expected sigma in height", _length(self.seen.sigma_z_m, self.placed.metric)),
                 ("expected sigma in plan", _length(self.seen.sigma_xy_m, self.placed.metric)),
             ]
-        rows.append(("images that will be placed (expected)", f"{self.chances.sum():.0f} of {len(self.flight)}"))
+        known = "expected" if self.seen is not None else "expected, if they overlap"
+        rows.append((f"images that will be placed ({known})", f"{self.chances.sum():.0f} of {len(self.flight)}"))
         if self.motion_px is not None:
             rows.append(("motion during an exposure", f"{self.motion_px:.1f} px"))
         sharp = relative_sharpness(self.flight, self.looks)

@@ -18,7 +18,6 @@ HALF_LINKED, SOFTNESS = 0.22, 0.03
 """Shared usable ground at which two images are linked in half of the cases, and how fast this changes: chosen
 by hand; ``benchmarks/registration.py`` measures what comes of it."""
 
-
 FACING_DEG, APART_DEG = 15.0, 35.0
 """Between views that differ by less than the first, overlap alone decides; by more than the second nothing matches."""
 
