@@ -21,16 +21,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import re
 import shutil
-import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 from truth.case import CELLS, Case, measure
+from truth.cost import run_measured
 
 from overfly.metrics.functional import THRESHOLDS_M
 from overfly.scenes import STYLES
@@ -47,25 +44,15 @@ def run_map(case: Case, folder: Path, dense: str, network: str | None) -> dict[s
     command += ["--cameras", "given", "--dense", dense]
     command += ["--network", network] if network and dense == "sweep" else []
     folder.mkdir(parents=True, exist_ok=True)
-    start, peak_kb = time.perf_counter(), 0
-    with (case.folder / f"{folder.name}.log").open("w") as log:
-        child = subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | {"OMP_NUM_THREADS": "1"})
-        while not (ended := os.wait4(child.pid, os.WNOHANG))[0]:
-            # The peak that wait4 tells includes this process's own size when it started the child.
-            held = re.search(r"VmHWM:\s*(\d+)", Path(f"/proc/{child.pid}/status").read_text())
-            peak_kb = int(held[1]) if held else peak_kb
-            time.sleep(0.2)
-    _, status, usage = ended
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
+    try:
+        cost = run_measured(command, case.folder / f"{folder.name}.log", env={"OMP_NUM_THREADS": "1"})
+    except RuntimeError:
         shutil.rmtree(folder)
-        raise RuntimeError((case.folder / f"{folder.name}.log").read_text().strip().splitlines()[-1])
+        raise
     facts = json.loads((folder / "map.json").read_text())
     return {
-        "core_seconds": usage.ru_utime + usage.ru_stime,
-        "seconds": time.perf_counter() - start,
+        **cost,
         "dense_seconds": facts["seconds"]["dense"],
-        "peak_mb": peak_kb / 1024,
         "network": network if dense == "sweep" else None,
     }
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import Delaunay, cKDTree
 from truth.surface import Surface
 
 from overfly.cloud import Cloud, read_cloud, voxel_thin
 from overfly.flights import Flight, find_preset, fly, read_flight
 from overfly.flights.launch import default_area
+from overfly.flights.noise import NOISE, PoseNoise
 from overfly.flights.plan import DEFAULT_TILT_DEG
 from overfly.geodesy import enu_from_crs
 from overfly.geometry import Array, pixel_grid, unproject
@@ -38,12 +39,16 @@ STEEP = 0.5
 
 @dataclass
 class Case:
-    """One flight: a style or scene file, flown on a path with an overlap at an altitude (metres)."""
+    """One flight: a style or scene file, flown on a path with an overlap at an altitude (metres).
+
+    ``noise`` is that of the positions and angles in the images' metadata.
+    """
 
     scene_name: str
     cell: str
     altitude: float
     work: Path
+    noise: PoseNoise = NOISE["none"]
 
     @property
     def name(self) -> str:
@@ -76,7 +81,7 @@ class Case:
         if not (folder / "transforms.json").is_file():
             path, overlap = CELLS[self.cell]
             options: dict[str, Any] = {"width": 800, "height": 600, "frames": FRAMES, "seed": SEED}
-            options |= {"overlap": overlap, "altitude": self.altitude, "area_m": self.area}
+            options |= {"overlap": overlap, "altitude": self.altitude, "area_m": self.area, "noise": self.noise}
             fly(self.scene, out=folder, flight_path=path, **options)
         return read_flight(folder)
 
@@ -97,6 +102,11 @@ class Case:
             np.save(kept, self.surface.count_views(points, *self.cameras))
         views = np.load(kept)
         return points[views > 0], views[views > 0]
+
+    def interior(self, points: Array) -> NDArray[np.bool_]:
+        """Whether each point [N, 3] lies straight below the area that the cameras stand around."""
+        stands = np.array([pose[:2, 3] for pose in self.cameras[1]])
+        return np.asarray(Delaunay(stands).find_simplex(points[:, :2]) >= 0)
 
     def exact_cloud(self) -> Cloud:
         """What the images see, from their true depth: one point per ground pixel."""
@@ -119,8 +129,9 @@ class Case:
 def measure(case: Case, cloud: Cloud) -> dict[str, Any]:
     """All figures of a cloud in the cameras' frame; lengths in metres, the rest shares.
 
-    ``seen_1``, ``seen_2``, ``seen_3`` (three or more), ``walls`` and ``level`` are parts of the reference, and
-    ``recall_1_...`` the recall at 1 m there. ``error_...`` are distances from the cloud to surface that two or more
+    ``seen_1``, ``seen_2``, ``seen_3`` (three or more), ``walls``, ``level``, ``interior`` (see
+    :meth:`Case.interior`) and ``interior_level`` are parts of the reference, and ``recall_1_...``, ``recall_2_...`` the
+    recall at 1 and 2 m there. ``error_...`` are distances from the cloud to surface that two or more
     images see, or one (``_seen_1``). ``within_k_sigma`` is the share of measured points, off the walls, whose error in
     height is below k times the stated ``sigma_m``.
     """
@@ -136,9 +147,10 @@ def measure(case: Case, cloud: Cloud) -> dict[str, Any]:
         found |= {f"fscore_{t:g}": harmonic(precision, recall), f"precision_{t:g}": precision, f"recall_{t:g}": recall}
     walls = case.surface.nearest(reference).upward <= STEEP
     parts = {"seen_1": seen_by == 1, "seen_2": seen_by == 2, "seen_3": seen_by >= 3, "walls": walls, "level": ~walls}
+    parts |= {"interior": case.interior(reference), "interior_level": case.interior(reference) & ~walls}
     for label, mask in parts.items():
         found[label] = float(mask.mean())
-        found[f"recall_1_{label}"] = share(missing < 1, mask)
+        found |= {f"recall_{t}_{label}": share(missing < t, mask) for t in (1, 2)}
     for label, mask in (("", views >= 2), ("_seen_1", views == 1)):
         errors = near.distance[mask]
         found[f"error_median{label}"] = float(np.median(errors)) if len(errors) else None

@@ -16,6 +16,7 @@ from overfly.errors import InputError
 from overfly.flights import Flight, Frame, read_flight
 from overfly.geodesy import Origin, enu_from_geodetic, geodetic_from_enu
 from overfly.geometry import fit_similarity, transform
+from overfly.mapping import normal_equations
 from overfly.mapping.align import align
 from overfly.mapping.database import focal_px
 from overfly.mapping.features import image_pairs
@@ -88,6 +89,16 @@ def test_the_same_seed_gives_the_same_cameras_and_kept_matches_are_reused(  # ty
     np.testing.assert_array_equal(again.poses, block.poses)
     assert stamps == {p: p.stat().st_mtime_ns for p in (tmp_path / "features").iterdir()}
     assert matches
+
+
+def test_long_flights_solve_sparse_equations_and_find_the_same(block, strip_flight, kept, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    """Flights of some hundred images do not fit a full matrix: the same equations are solved another way."""
+    monkeypatch.setattr(normal_equations, "MOST_DENSE", 0)
+    monkeypatch.setattr(normal_equations, "POINTS_AT_ONCE", 500)
+    sparse = align(strip_flight, workdir=kept, seed=0, bar=bar)
+    np.testing.assert_allclose(sparse.poses, block.poses, atol=1e-4)
+    assert sparse.cameras[0].fx == pytest.approx(block.cameras[0].fx, rel=1e-6)
+    assert sparse.precision.summary() == block.precision.summary()
 
 
 def test_without_gps_it_is_levelled_and_not_metric(strip_flight, strips, kept) -> None:  # type: ignore[no-untyped-def]
