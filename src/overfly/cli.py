@@ -148,7 +148,18 @@ def map_(
     ] = None,
     resume: Annotated[bool, typer.Option(help="Reuse finished steps of an interrupted map in --out.")] = True,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace another flight's map in --out.")] = False,
+    heights: Annotated[
+        str | None,
+        typer.Option(
+            help="Of the products: ellipsoidal, egm96, egm2008, or the EPSG code of a vertical CRS. Default: as in "
+            "gcp_list.txt, else ellipsoidal."
+        ),
+    ] = None,
     ply: Annotated[bool, typer.Option("--ply", help="Write cloud.ply too.")] = False,
+    mesh: Annotated[
+        bool, typer.Option("--mesh", help="Write mesh.glb too: the surface, textured from the photographs.")
+    ] = False,
+    mesh_faces: Annotated[int | None, typer.Option(help="Its triangles, about. Default: 200000.")] = None,
     seed: Annotated[int, typer.Option(help="Of every random choice.")] = 0,
 ) -> None:
     """Photographs in, map out: coloured cloud, height raster, orthophoto and report."""
@@ -172,7 +183,10 @@ def map_(
         max_memory_gb=max_memory,
         resume=resume,
         overwrite=overwrite,
+        heights=heights,
         ply=ply,
+        mesh=mesh,
+        mesh_faces=mesh_faces,
         seed=seed,
     )
 

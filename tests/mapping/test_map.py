@@ -240,6 +240,8 @@ def test_a_moved_flight_is_still_the_same(tmp_path: Path) -> None:
         ({"cameras": "some"}, "--cameras 'some' is unknown"),
         ({"max_memory_gb": 0}, "--max-memory 0"),
         ({"size": 10}, "--size 10"),
+        ({"mesh": True, "mesh_faces": 3}, "^--mesh-faces 3 is not possible: give 100 to"),
+        ({"mesh_faces": 5000}, "add --mesh"),
     ],
 )
 def test_wrong_settings_are_refused_before_anything_is_written(
@@ -315,14 +317,55 @@ def test_a_frame_whose_z_is_not_up_gets_no_rasters_and_keeps_its_cloud(tmp_path:
     out = tmp_path / "out"
     out.mkdir()
     tiles = write_tiles(tmp_path / "tiles", [cloud[:1000], cloud[1000:]])
-    summary = deliver(lying, given_block(lying), tiles, out, MapSettings(dense="stereo"), steps)
+    summary = deliver(lying, given_block(lying), tiles, out, MapSettings(dense="stereo", mesh=True), steps)
     assert not (out / "dsm.tif").exists()
-    assert "does not point up" in summary["warnings"][0]
+    assert not (out / "mesh.glb").exists()
+    assert summary["mesh"] is None
+    assert "so there is no raster and no mesh" in summary["warnings"][0]
     np.testing.assert_allclose(read_cloud(out / "cloud.laz").points, cloud.points, atol=1e-3)
     assert summary["gsd_m"] == pytest.approx(55 / 80, rel=0.02)
     flat = write_tiles(tmp_path / "flat", [Cloud(ground)])
-    deliver(lying, upright_block, flat, out, MapSettings(dense="stereo"), steps)
+    summary = deliver(lying, upright_block, flat, out, MapSettings(dense="stereo", mesh=True), steps)
     assert (out / "dsm.tif").exists()
+    assert summary["mesh"] is None  # the other products must not be lost for it
+    assert any(w.startswith("There is no mesh.glb. The cloud has no colours") for w in summary["warnings"])
+    assert json.loads((out / "map.json").read_text()) == summary
+
+
+def test_a_mesh_is_written_beside_the_other_products(tmp_path: Path) -> None:
+    import trimesh
+
+    flight = make_flight(tmp_path / "f", block={"altitude": 55.0, "origin": ORIGIN})
+    out = tmp_path / "out"
+    summary = mapped(flight, out, mesh=True, mesh_faces=1000)
+    facts = summary["mesh"]
+    assert facts["crs"] == summary["crs"] == "EPSG:32615"
+    assert facts["faces"] == pytest.approx(1000, rel=0.2)
+    assert facts["textured_share"] > 0.7
+    assert summary["settings"]["mesh_faces"] == 1000
+    report = (out / "report.html").read_text()
+    assert "mesh.glb" in report
+    assert f"{facts['textured_share']:.0%} of the surface shows photographs" in report
+    scene = trimesh.load_scene(out / "mesh.glb")
+    (part,) = scene.geometry.values()
+    x, y, z = np.asarray(part.vertices).T
+    placed = np.column_stack([x, -z, y]) + facts["origin"]
+    corner = crs_from_enu([[0, 0, GROUND]], Origin(46.84, -91.99, 150.0))[0]
+    assert np.abs(placed[:, 2] - corner[2]).max() < 0.01
+    rgb = np.asarray(part.visual.to_color().vertex_colors)[:, :3].astype(float)
+    assert np.abs(rgb[:, :2] - 128 - (placed - corner)[:, :2]).mean() < 3
+    first = (out / "mesh.glb").read_bytes()
+    again = mapped(flight, out, mesh=True, mesh_faces=1000)
+    assert again["reused"] == ["cameras", "dense"]
+    assert (out / "mesh.glb").read_bytes() == first
+    assert mapped(flight, out)["mesh"] is None
+    assert not (out / "mesh.glb").exists()  # what map.json does not tell of is not there
+
+
+def test_a_mesh_has_no_more_triangles_than_points(tmp_path: Path) -> None:
+    summary = mapped(make_flight(tmp_path / "f"), tmp_path / "out", mesh=True, mesh_faces=1_000_000)
+    assert summary["mesh"]["faces"] <= 1.05 * summary["points"]
+    assert any(w.startswith("--mesh-faces 1000000 asks for more triangles than") for w in summary["warnings"])
 
 
 def test_stereo_measures_the_ground_without_a_network(tmp_path: Path) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from overfly import __version__
 from overfly.cloud import Cloud, write_clouds
@@ -20,14 +22,17 @@ from overfly.mapping.block import Block
 from overfly.mapping.block_marks import marks_of
 from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
+from overfly.mapping.gains import Gains
 from overfly.mapping.gallery import gallery, upright
 from overfly.mapping.orthophoto import Orthophoto
 from overfly.mapping.products import SAMPLE, WINDOW, raster_products
-from overfly.mapping.raster import Surface
-from overfly.mapping.report import Caution, duration, write_report
-from overfly.mapping.settings import MapSettings
+from overfly.mapping.raster import Grid, Surface
+from overfly.mapping.report import Caution, count_text, duration, write_report
+from overfly.mapping.rough_mesh import rough_mesh
+from overfly.mapping.settings import MESH_FACES, MapSettings
 from overfly.mapping.steps import Steps, peak_memory_mb
 from overfly.mapping.tiles import Tiles
+from overfly.mapping.visibility import View
 
 LEVEL = 0.5
 """Cosine of the largest angle between up, as the cameras tell it, and the frame's z axis."""
@@ -73,14 +78,18 @@ def deliver(
             write_clouds(placed, out / name, count=len(placed), low=placed.bounds.min((0, 1)))
         facts = {} if block.metric else {"scale": "unknown"}
         write_transforms(out / "transforms.json", block.frames, block.origin, facts)
-        for name in ("dsm.tif", "orthophoto.tif"):
+        for name in ("dsm.tif", "orthophoto.tif", "mesh.glb"):
             (out / name).unlink(missing_ok=True)
         if level:
-            photographs = partial(Orthophoto, block.frames, origin=block.origin if few_placed.epsg else None)
-            raster_products(placed, out, gsd=gsd, painter=photographs, window=window, sample=sample)
+            views, gains = _rasters(placed, block, few_placed.epsg, out, gsd=gsd, window=window, sample=sample)
             written += ["dsm.tif", "orthophoto.tif"]
         written += ["transforms.json", "map.json"]
     steps.say("products", ", ".join(written[:-1]))
+    mesh, unmade = None, list[Caution]()
+    if asked.mesh and level:
+        with steps.timed("mesh"):
+            mesh, unmade = _mesh(few, block, views, gains, out / "mesh.glb", asked, steps)
+        written += ["mesh.glb"] if mesh else []
     with steps.timed("report"):
         shown, seen = gallery(
             few.with_points(transform(turn, few.points)),
@@ -93,8 +102,9 @@ def deliver(
             missing=list(block.gps_positions(lost_frames(flight, block)).items()),
             marks=marks_of(block) if level and block.cameras_from == "estimated" else None,
         )
-    summary = summarise(flight, block, cloud_facts(placed, few_placed, seen, gsd), few_placed.epsg, asked, steps)
-    found = _cautions(flight, block, seen, summary, level)
+    summary = summarise(flight, block, cloud_facts(placed, few_placed, seen, gsd), few_placed.crs, asked, steps)
+    summary["mesh"] = mesh
+    found = [*_cautions(flight, block, seen, summary, level), *unmade]
     summary["warnings"] = [str(c).strip() for c in found]
     with steps.timed("report"):
         write_report(
@@ -114,11 +124,53 @@ def deliver(
     return summary
 
 
+def _rasters(
+    placed: Tiles, block: Block, epsg: int | None, out: Path, *, gsd: float, window: int, sample: int
+) -> tuple[list[View], Gains]:
+    """Write surface model and orthophoto; the frames that stand above the surface, and their gains."""
+    made: list[Orthophoto] = []
+
+    def photographs(overview: Grid, heights: NDArray) -> Orthophoto:
+        made.append(Orthophoto(block.frames, overview, heights, origin=block.origin if epsg else None))
+        return made[0]
+
+    raster_products(placed, out, gsd=gsd, painter=photographs, window=window, sample=sample)
+    return made[0].frames, made[0].gains
+
+
+def _mesh(
+    few: Cloud, block: Block, views: Sequence[View], gains: Gains, path: Path, asked: MapSettings, steps: Steps
+) -> tuple[dict[str, Any] | None, list[Caution]]:
+    """Write the textured mesh: its facts, or None and why there is none; the map is worth having without."""
+    from overfly.mapping.textured_mesh import write_textured_mesh
+
+    faces, found = min(asked.mesh_faces or MESH_FACES, len(few)), list[Caution]()
+    if asked.mesh_faces is not None and asked.mesh_faces > faces:
+        what = f"--mesh-faces {asked.mesh_faces} asks for more triangles than the {faces} points that the mesh is of."
+        found.append(Caution(what, "It has one a point; match at a larger --size, or allow more --max-memory."))
+    placed = georeferenced(few[:0], block)
+    try:
+        made = write_textured_mesh(
+            path,
+            rough_mesh(few, faces=faces),
+            views,
+            gains,
+            place=lambda points: georeferenced(Cloud(points), block).points,
+            crs=placed.crs,
+            bar=steps.bar,
+        )
+    except InputError as error:
+        return None, [*found, Caution("There is no mesh.glb.", str(error))]
+    steps.say("mesh", f"{count_text(made['faces'])} triangles, {made['textured_share']:.0%} textured by photographs")
+    return made, found
+
+
 def georeferenced(local: Cloud, block: Block) -> Cloud:
     """The cloud in the block's projected CRS; unchanged where the block has no place on the Earth."""
     if block.origin is None or not block.metric:
         return local
-    return local.with_points(crs_from_enu(local.points, block.origin), block.origin.crs_epsg)
+    origin = block.origin
+    return local.with_points(crs_from_enu(local.points, origin), origin.crs_epsg, origin.vertical_epsg)
 
 
 def lost_frames(flight: Flight, block: Block) -> list[Frame]:
@@ -128,9 +180,9 @@ def lost_frames(flight: Flight, block: Block) -> list[Frame]:
 
 
 def summarise(
-    flight: Flight, block: Block, counted: dict[str, Any], epsg: int | None, asked: MapSettings, steps: Steps
+    flight: Flight, block: Block, counted: dict[str, Any], crs: str | None, asked: MapSettings, steps: Steps
 ) -> dict[str, Any]:
-    """The content of ``map.json``, its warnings still empty; ``counted`` is of the cloud, ``epsg`` its CRS."""
+    """The content of ``map.json``, its warnings still empty; ``counted`` is of the cloud, ``crs`` its CRS."""
     return {
         "images": len(flight) + len(flight.skipped),
         "registered": len(block.frames),
@@ -138,7 +190,7 @@ def summarise(
         "measured": counted["measured"],
         "predicted": counted["predicted"],
         "gsd_m": round(counted["gsd"], 5) if block.metric else None,
-        "crs": None if epsg is None else f"EPSG:{epsg}",
+        "crs": crs,
         "cameras_from": block.cameras_from,
         "seconds": steps.seconds,
         "peak_memory_mb": round(peak_memory_mb(), 1),
@@ -174,7 +226,7 @@ def _cautions(flight: Flight, block: Block, seen: Surface, summary: dict[str, An
         found.insert(
             0,
             Caution(
-                "The z axis of the cameras' frame does not point up, so there is no dsm.tif and no orthophoto.tif.",
+                "The z axis of the cameras' frame does not point up, so there is no raster and no mesh.",
                 "The pictures here are turned for reading, the cloud is not; give cameras in a frame with z up, "
                 "or map with --cameras estimate.",
             ),

@@ -44,6 +44,7 @@ FILES = {
     "cloud.ply": "the same for mesh programs",
     "dsm.tif": "surface heights (GeoTIFF)",
     "orthophoto.tif": "colours seen from straight above (GeoTIFF)",
+    "mesh.glb": "the surface as a mesh, textured from the photographs (glTF, local coordinates)",
     "transforms.json": "the cameras used, in local metres east, north, up",
     "map.json": "the numbers of this report for programs",
 }
@@ -104,7 +105,7 @@ def write_report(
         total=duration(sum(seconds.values())),
         memory=f"{summary['peak_memory_mb'] / 1024:.1f} GB",
         settings=[{"label": k, "value": "–" if v is None else v} for k, v in settings.items()],
-        files=[{"name": name, "what": FILES[name]} for name in written if name in FILES],
+        files=[{"name": n, "what": FILES[n] + _about_mesh(summary, n)} for n in written if n in FILES],
         version=__version__,
         unit_name="metres" if summary["metric"] else "units of unknown length",
         crs=summary["crs"],
@@ -232,6 +233,16 @@ def _surveyed(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     elif why := precision.get("why_not"):
         rows.append(("Camera positions, standard deviation", "unknown", why))
     return rows
+
+
+def _about_mesh(summary: Mapping[str, Any], name: str) -> str:
+    if name != "mesh.glb" or not (mesh := summary.get("mesh")):
+        return ""
+    x, y, z = (f"{value:.0f}" for value in mesh["origin"])
+    return (
+        f"; {count_text(mesh['faces'])} triangles; {mesh['textured_share']:.0%} of the surface shows photographs, "
+        f"the rest the cloud's colours; its origin is {x}, {y}, {z}"
+    )
 
 
 def _missing(summary: Mapping[str, Any]) -> list[dict[str, str]]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from overfly.errors import InputError, unknown
+from overfly.geodesy import vertical_crs
 from overfly.mapping.matches import MATCHERS
 from overfly.mapping.survey import CONTROL
 from overfly.mapping.sweep import TrainedRun
@@ -15,6 +16,12 @@ DENSE = ("sweep", "stereo")
 
 SIZE = 1600
 """Default of the longest side at which images are matched, pixels."""
+
+MESH_FACES = 200_000
+"""Default of the triangles of the textured mesh."""
+
+FACES = (100, 2_000_000)
+"""Fewest and most of them: less shows no landscape, more fits into no viewer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +40,11 @@ class MapSettings:
         max_memory_gb: memory that the dense step and the products may take; None: half of what is free, at most 6.
         resume: reuse finished steps of an earlier map of the same images with the same settings.
         overwrite: replace another flight's map in the same folder.
+        heights: vertical CRS of the products by name or code (:func:`overfly.geodesy.vertical_crs`); None: that of
+            gcp_list.txt, else heights above the ellipsoid.
         ply: write ``cloud.ply`` too.
+        mesh: write the textured mesh ``mesh.glb`` too; one that an earlier map left is removed.
+        mesh_faces: about so many triangles; None: :data:`MESH_FACES`. Only with ``mesh``.
         size: longest side at which images are matched, pixels: a half takes a quarter of the time.
         seed: of every random choice.
         progress: tell each step on stderr.
@@ -48,7 +59,10 @@ class MapSettings:
     max_memory_gb: float | None = None
     resume: bool = True
     overwrite: bool = False
+    heights: str | None = None
     ply: bool = False
+    mesh: bool = False
+    mesh_faces: int | None = None
     size: int = SIZE
     seed: int = 0
     progress: bool = True
@@ -76,6 +90,16 @@ class MapSettings:
             raise InputError(
                 f"--size {self.size} is too small to match images: give 64 pixels or more, such as {SIZE}."
             )
+        if self.heights is not None:
+            vertical_crs(self.heights)
+        if self.mesh_faces is not None:
+            if not self.mesh:
+                raise InputError(f"--mesh-faces {self.mesh_faces} asks for no mesh: add --mesh, or leave it out.")
+            if not FACES[0] <= self.mesh_faces <= FACES[1]:
+                raise InputError(
+                    f"--mesh-faces {self.mesh_faces} is not possible: give {FACES[0]} to {FACES[1]} triangles, "
+                    f"such as {MESH_FACES}."
+                )
         if self.max_memory_gb is not None and not self.max_memory_gb > 0:
             raise InputError(f"--max-memory {self.max_memory_gb} is not possible: give gigabytes above 0, such as 4.")
 
@@ -86,8 +110,10 @@ class MapSettings:
             "dense": self.dense,
             "matcher": self.matcher,
             "control": self.control,
+            "heights": self.heights,
             "network": self.network_name if self.dense == "sweep" or self.matcher != "sift" else None,
             "max_memory_gb": self.max_memory_gb,
             "size": self.size,
             "seed": self.seed,
+            "mesh_faces": (self.mesh_faces or MESH_FACES) if self.mesh else None,
         }

@@ -163,7 +163,7 @@ class Steps:
             yield update
 
 
-OWN = ("cloud.laz", "cloud.ply", "dsm.tif", "orthophoto.tif", "map.json", "report.html", "transforms.json")
+OWN = ("cloud.laz", "cloud.ply", "dsm.tif", "orthophoto.tif", "mesh.glb", "map.json", "report.html", "transforms.json")
 
 
 def claim(out: Path, flight: Path, identity: str, *, overwrite: bool) -> Path:
