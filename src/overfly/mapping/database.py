@@ -24,11 +24,15 @@ MODEL = "RADIAL"
 
 
 def focal_px(frame: Frame) -> float | None:
-    """Focal length in pixels by the camera's data sheet, the EXIF focal-plane tags or the 35 mm equivalent."""
+    """Focal length in pixels by the camera's data sheet, the EXIF focal-plane tags or the 35 mm equivalent.
+
+    An image of another shape than the sensor is a part of it that fills it in one direction.
+    """
     if frame.model and frame.focal_mm:
         try:
             preset = find_preset(frame.model)
-            return float(frame.focal_mm / preset.sensor_mm[0] * max(frame.width, frame.height))
+            usual = preset.camera(max(frame.width, frame.height), min(frame.width, frame.height))
+            return float(usual.fx * frame.focal_mm / preset.focal_mm)
         except InputError:
             pass  # a camera without a data sheet here
     if frame.focal_px:
