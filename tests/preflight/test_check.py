@@ -23,8 +23,9 @@ from overfly.preflight.findings import Finding, ranked
 from overfly.preflight.gaps import gaps_of
 from overfly.preflight.ground import lines_of, place
 from overfly.preflight.images import look, look_at_all
-from overfly.preflight.positions import off_track, position_findings
+from overfly.preflight.positions import position_findings
 from overfly.preflight.quality import camera_findings, image_findings
+from overfly.preflight.track import off_track
 
 
 @pytest.fixture(scope="module")

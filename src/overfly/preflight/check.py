@@ -202,7 +202,7 @@ def check_flight(
     seen = cover(placed) if placed is not None else None
     gaps = gaps_of(seen, placed.poses[:, :2, 3]) if placed is not None and seen is not None else []
     motion = _motion(flight, looks, placed, seen)
-    findings = [*position_findings(flight, placed)]
+    findings = [*position_findings(flight, placed, looks)]
     if placed is not None and seen is not None:
         findings += overlap_findings(placed, seen, gaps)
     elif placed is not None:

@@ -5,28 +5,33 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from overfly.flights import Flight, Frame
 from overfly.geometry import Array
+from overfly.preflight.displacements import Displacements
+from overfly.preflight.evidence import Evidence
 from overfly.preflight.findings import Finding, count, some
 from overfly.preflight.ground import Placement, positions
-
-OFF_TRACK = 8.0
-"""Metres: less than this off the track is within what receivers without RTK do."""
+from overfly.preflight.images import Look
+from overfly.preflight.track import TIMES_USUAL, strays
 
 HEIGHT_JUMP = 12.0
 """Metres between an image and its neighbours in the flight; receivers without RTK wander by less."""
-
-TIMES_USUAL = 6.0
-"""An outlier is this many times further off than the flight's images usually are."""
 
 DISAGREE = 0.25
 """Relative difference of two altitudes above ground that is no longer slope and noise."""
 
 
-def position_findings(flight: Flight, placed: Placement | None) -> Iterator[Finding]:
-    """What is wrong with the positions; cameras that the folder gives are taken as right."""
+def position_findings(
+    flight: Flight, placed: Placement | None, looks: Sequence[Look] | None = None
+) -> Iterator[Finding]:
+    """What is wrong with the positions; cameras that the folder gives are taken as right.
+
+    Args:
+        flight: its frames.
+        placed: over the ground; None where this is not known.
+        looks: at the images, in parallel with the frames, to hold their pictures against their positions.
+    """
     yield from _missing(flight)
     if flight.cameras_from is None:
         frames = [f for f in flight.frames if f.gps is not None]
@@ -34,10 +39,17 @@ def position_findings(flight: Flight, placed: Placement | None) -> Iterator[Find
         if len(frames) >= 2 and origin is not None:
             xy = positions(frames, origin)
             yield from _stuck(frames, xy)
-            yield from _off_track(frames, xy)
+            yield from _off_track(frames, xy, _evidence(flight, xy, placed, looks))
         yield from _heights(flight.frames)
     if placed is not None:
         yield from _altitude(placed)
+
+
+def _evidence(flight: Flight, xy: Array, placed: Placement | None, looks: Sequence[Look] | None) -> Evidence | None:
+    if placed is None or looks is None:
+        return None
+    known = [look for frame, look in zip(flight.frames, looks, strict=True) if frame.gps is not None]
+    return Evidence(xy, Displacements(placed, known).between) if len(known) == len(placed.frames) else None
 
 
 def _missing(flight: Flight) -> Iterator[Finding]:
@@ -88,24 +100,6 @@ def _apart(a: Frame, b: Frame) -> bool:
     return a.time is not None and b.time is not None and abs((b.time - a.time).total_seconds()) >= 1.0
 
 
-def off_track(xy: Array, seconds: Array | None = None) -> Array:
-    """How far each of n positions [n, 2] is from where its neighbours in the flight expect it, metres [n].
-
-    The least of three answers counts: between both neighbours, and onwards from the two before and from the two after;
-    so corners of the track are no faults. With times [n] the neighbours' speed is used.
-    """
-    t = np.arange(len(xy), dtype=float) if seconds is None else seconds
-    away = np.full((3, len(xy)), np.inf)
-    index = np.arange(len(xy))
-    for row, (before, after) in enumerate(((-1, 1), (-2, -1), (1, 2))):
-        i = index[(index + before >= 0) & (index + after < len(xy))]
-        a, b = i + before, i + after
-        share = (t[i] - t[a]) / (t[b] - t[a])
-        expected = xy[a] + (xy[b] - xy[a]) * share[:, None]
-        away[row, i] = np.linalg.norm(xy[i] - expected, axis=1)
-    return np.asarray(away.min(0))
-
-
 def _seconds(frames: Sequence[Frame]) -> Array | None:
     times = [f.time for f in frames]
     if any(t is None for t in times):
@@ -114,44 +108,23 @@ def _seconds(frames: Sequence[Frame]) -> Array | None:
     return seconds if np.all(np.diff(seconds) > 0) else None
 
 
-def strays(xy: Array, seconds: Array | None) -> list[tuple[int, float]]:
-    """Positions [n, 2] off the track and by how much, the worst first.
-
-    Near a wrong position right ones look wrong too: of it and its neighbours the one is meant without which the rest of
-    the track is smoothest. An error at a corner of the track towards the next line is a possible track and not told.
-    """
-
-    def away(kept: NDArray[np.int64]) -> Array:
-        by_order = off_track(xy[kept])
-        return by_order if seconds is None else np.minimum(by_order, off_track(xy[kept], seconds[kept]))
-
-    kept = np.arange(len(xy))
-    first = away(kept)
-    limit = max(OFF_TRACK, TIMES_USUAL * float(np.median(first)))
-    found: list[tuple[int, float]] = []
-    while len(kept) >= 6 and len(found) < len(xy) // 4:
-        now = away(kept)
-        worst = int(now.argmax())
-        if now[worst] <= limit:
-            break
-        near = kept[max(0, worst - 9) : worst + 10]
-        suspects = kept[max(0, worst - 2) : worst + 3].tolist()
-        left = [float(np.minimum(away(near[near != k]), 2 * limit).sum()) for k in suspects]
-        wrong = suspects[int(np.argmin(left))]
-        found.append((wrong, float(now[kept == wrong][0])))
-        kept = kept[kept != wrong]
-    return sorted(found, key=lambda entry: -entry[1])
-
-
-def _off_track(frames: Sequence[Frame], xy: Array) -> Iterator[Finding]:
-    if len(frames) < 6 or not (found := strays(xy, _seconds(frames))):
+def _off_track(frames: Sequence[Frame], xy: Array, evidence: Evidence | None) -> Iterator[Finding]:
+    found = strays(xy, _seconds(frames)) if len(frames) >= 6 else []
+    accused: dict[int, float] = {}
+    if evidence is not None:
+        excused = evidence.excused(found)
+        accused = dict(evidence.accused())
+        found = [(i, off) for i, off in found if i not in excused and i not in accused]
+    if not found and not accused:
         return
+    found = sorted([*found, *accused.items()], key=lambda entry: -entry[1])
     names = [frames[i].name for i, _ in found]
     which = count(len(found), "GPS position")
+    where = "off where the pictures show them" if accused else "off the track of the neighbours"
     yield Finding(
         "warn",
         "gps",
-        f"{which} up to {found[0][1]:.0f} m off the track of the neighbours ({some(names)})",
+        f"{which} up to {found[0][1]:.0f} m {where} ({some(names)})",
         "correct or remove these positions (geo.txt, or images without GPS tags are placed by matching)",
         tuple(names),
     )

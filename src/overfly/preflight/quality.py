@@ -28,6 +28,11 @@ Those = Callable[[NDArray | Sequence[bool]], tuple[str, ...]]
 """Names of the images for which a list of truths holds."""
 
 FLAT, ALL_FLAT = 0.5, 0.9
+"""Share of the picture without texture that costs a part of an image, and that leaves nothing of it."""
+
+MANY = 0.1
+"""Share of the images from which on a map lacks a part without them."""
+
 FOCALS_DISAGREE = 0.05
 
 
@@ -70,7 +75,7 @@ def image_findings(flight: Flight, looks: Sequence[Look], motion_px: float | Non
         blurred = those(relative_sharpness(flight, looks) < BLURRED)
     if blurred:
         yield Finding(
-            "bad" if len(blurred) > 0.1 * len(names) else "warn",
+            "bad" if len(blurred) > MANY * len(names) else "warn",
             "blur",
             f"{count(len(blurred), 'image')} of {len(names)} much less sharp than the others ({some(blurred)})",
             "remove them if their neighbours still overlap, else fly there again, slower or with a shorter exposure",
@@ -125,7 +130,16 @@ def _texture(looks: Sequence[Look], those: Those) -> Iterator[Finding]:
         )
         return
     with np.errstate(invalid="ignore"):
-        found = those(flat > FLAT)
+        nothing, found = those(flat > ALL_FLAT), those((flat > FLAT) & (flat <= ALL_FLAT))
+    if nothing:
+        # Holes at a shore are one thing, images that nothing can place another: it is said first, as blur is.
+        yield Finding(
+            "bad" if len(nothing) > MANY * len(looks) else "warn",
+            "texture",
+            f"{count(len(nothing), 'image')} of {len(looks)} without any texture ({some(nothing)})",
+            "they will not be placed and leave holes; look at them: water, snow, fog or a covered lens cannot be matched",
+            nothing,
+        )
     if found:
         text = f"{count(len(found), 'image')} with more than half of the picture without texture ({some(found)})"
         remedy = "expect holes there (water, snow, fresh asphalt); more overlap or a greater height helps at the shore"

@@ -1,0 +1,204 @@
+"""Where a flight goes and which of its positions do not belong to it, from the positions alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.geometry import Array
+
+OFF_TRACK = 8.0
+"""Metres: less than this off the track is within what receivers without RTK do."""
+
+TIMES_USUAL = 6.0
+"""An outlier is this many times further off than the flight's images usually are."""
+
+ALONG_DEG, ACROSS_DEG = 20.0, 30.0
+"""Steps nearer to the direction of the lines than the first go along a line, further off than the second turn."""
+
+LEAST_ALONG = 0.4
+"""Share of steps along one direction from which a flight consists of lines."""
+
+LEAST_SECOND = 0.2
+"""Share of steps on lines across the others from which they are lines of their own."""
+
+NEAR = 6
+"""Steps around a position that tell to which lines it belongs."""
+
+MORE_THAN_ELSEWHERE = 1.5
+"""Where a flight has no lines, its ends may turn so many times more than it does elsewhere."""
+
+
+def off_track(xy: Array, seconds: Array | None = None) -> Array:
+    """How far each of n positions [n, 2] is from where its neighbours in the flight expect it, metres [n].
+
+    The least of three answers counts: between both neighbours, and onwards from the two before and from the two after;
+    so corners of the track are no faults. With times [n] the neighbours' speed is used. Infinite below three positions.
+    """
+    return np.asarray(_answers(xy, seconds).min(0))
+
+
+def _answers(xy: Array, seconds: Array | None = None) -> Array:
+    """The three answers of :func:`off_track` [3, n]: between, from before, from after; inf where there is none."""
+    t = np.arange(len(xy), dtype=float) if seconds is None else seconds
+    away = np.full((3, len(xy)), np.inf)
+    index = np.arange(len(xy))
+    for row, (before, after) in enumerate(((-1, 1), (-2, -1), (1, 2))):
+        i = index[(index + before >= 0) & (index + after < len(xy))]
+        a, b = i + before, i + after
+        share = (t[i] - t[a]) / (t[b] - t[a])
+        expected = xy[a] + (xy[b] - xy[a]) * share[:, None]
+        away[row, i] = np.linalg.norm(xy[i] - expected, axis=1)
+    return away
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A flight of n positions as parallel lines.
+
+    Attributes:
+        places: along and across the lines [n, 2], metres.
+        ahead: direction of the lines, east and north [2].
+        step: usual distance along a line.
+        lines: whether the step from each position to the next goes along a line [n - 1].
+        turns: whether the step from each position to the next leads to another line [n - 1].
+    """
+
+    places: Array
+    ahead: Array
+    step: float
+    lines: NDArray[np.bool_]
+    turns: NDArray[np.bool_]
+
+
+def layouts_of(xy: Array) -> list[Layout]:
+    """The lines of positions [n, 2], one layout for each direction flown.
+
+    Empty where less than :data:`LEAST_ALONG` of the steps share a direction; a second one is of lines across these.
+    """
+    steps = np.diff(xy, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    if (lengths > 0).sum() < 3:
+        return []
+    bearing = np.where(lengths > 0, np.arctan2(steps[:, 0], steps[:, 1]), np.nan)
+    alike = np.abs((bearing[:, None] - bearing + np.pi / 2) % np.pi - np.pi / 2) < np.radians(ALONG_DEG)
+    best = alike[int(alike.sum(1).argmax())]
+    if best.sum() < LEAST_ALONG * len(steps):
+        return []
+    found = [_layout(xy, steps, lengths, best)]
+    across = np.abs((bearing - np.arctan2(*found[0].ahead) + np.pi) % np.pi - np.pi / 2) < np.radians(ALONG_DEG)
+    if (across[1:] & across[:-1]).sum() >= max(2, LEAST_SECOND * len(steps)):  # turns follow one by one on lines
+        found.append(_layout(xy, steps, lengths, across))
+    return found
+
+
+def _layout(xy: Array, steps: Array, lengths: Array, along_line: NDArray[np.bool_]) -> Layout:
+    bearing = np.arctan2(steps[along_line, 0], steps[along_line, 1])
+    # Directions that differ by half a turn are one: the mean is that of doubled angles.
+    angle = float(np.angle(np.exp(2j * bearing).mean()) / 2)
+    axes = np.array([[np.sin(angle), np.cos(angle)], [np.cos(angle), -np.sin(angle)]])
+    along, across = np.abs(steps @ axes.T).T
+    turns = (across > np.tan(np.radians(ACROSS_DEG)) * along) & (across > OFF_TRACK)
+    return Layout(xy @ axes.T, axes[0], float(np.median(lengths[along_line])), along_line, turns)
+
+
+def by_layout(layout: Layout) -> Array:
+    """How far each of n positions is from where the layout lets its neighbours go, metres [n]; inf without an answer.
+
+    Lines of one or two images, which pictures left out or the border of the ground make, have no track of their own. A
+    position may lie beside its neighbour as far as other lines of the flight do, and may continue such a short line.
+    """
+    places, turns = layout.places, layout.turns
+    # To another line and straight back again is an error, no turn: such steps are no precedents either.
+    back = np.zeros(len(places), bool)
+    across = np.abs(np.diff(places[:, 1]))
+    back[1:-1] = np.abs(places[2:, 1] - places[:-2, 1]) < np.minimum(across[1:], across[:-1]) / 2
+    back[1:-1] &= turns[1:] & turns[:-1]
+    known = turns & ~back[1:] & ~back[:-1]
+    forward = _onwards(places, turns, known, back, layout.step)
+    backward = _onwards(places[::-1], turns[::-1], known[::-1], back[::-1], layout.step)
+    return np.minimum(forward, backward[::-1])
+
+
+def _onwards(
+    places: Array, turns: NDArray[np.bool_], known: NDArray[np.bool_], back: NDArray[np.bool_], step: float
+) -> Array:
+    """Off what a turn from the position before, or the first step after such a turn, leads to, metres [n]."""
+    away, turned = np.full((2, len(places)), np.inf)
+    moved = np.abs(np.diff(places, axis=0))
+    for i in range(1, len(places)):
+        along, across = moved[i - 1]
+        others = known.copy()
+        others[max(0, i - 1) : i + 1] = False  # no step is its own precedent
+        if turns[i - 1] and not back[i] and others.any():
+            # A turn like it, or from the end of a line to any place of the next.
+            turned[i] = np.linalg.norm(moved[others] - moved[i - 1], axis=1).min()
+            goes_on = i + 1 == len(places) or (not turns[i] and abs(moved[i, 0] - step) < step / 2)
+            if goes_on and (i == 1 or not turns[i - 2]):
+                beside = float(np.abs(moved[others, 1] - across).min())
+                turned[i] = min(turned[i], float(np.hypot(beside, max(0.0, along - step))))
+        if turns[i - 1] and i + 1 < len(places):
+            # Where no other line tells how far away the next may be, an image onwards and parallel does.
+            turned[i] = min(turned[i], float(np.hypot(moved[i, 1], moved[i, 0] - step)))
+        if not back[i]:
+            away[i] = turned[i]
+        if i >= 2 and np.isfinite(turned[i - 1]):
+            away[i] = min(away[i], max(turned[i - 1], float(np.hypot(across, along - step))))
+    return away
+
+
+def _by_neighbours(xy: Array, seconds: Array | None) -> Array:
+    by_order = off_track(xy)
+    return by_order if seconds is None else np.minimum(by_order, off_track(xy, seconds))
+
+
+def _away(xy: Array, seconds: Array | None) -> Array:
+    """Off the track as its neighbours in order, in time or by the layout tell: the least counts, metres [n]."""
+    away = _by_neighbours(xy, seconds)
+    if len(xy) < 4:
+        return np.asarray(away)
+    if layouts := layouts_of(xy):
+        # Each position belongs to the lines that are flown around it.
+        near = np.array([np.convolve(one.lines, np.ones(NEAR), "full")[NEAR // 2 - 1 :][: len(xy)] for one in layouts])
+        told = np.where(near == near.max(0), [by_layout(one) for one in layouts], np.inf)
+        return np.asarray(np.minimum(away, told.min(0)))
+    # Without lines (orbits, free flights) every image may turn, but the ends have only one neighbour to tell it.
+    for ends, row in ((slice(0, 2), 2), (slice(-2, None), 1)):
+        others = np.delete(_answers(xy)[row], np.r_[np.arange(len(xy))[ends]])
+        usual = MORE_THAN_ELSEWHERE * float(others[np.isfinite(others)].max(initial=0.0))
+        away[ends] = np.where(away[ends] <= usual, 0.0, away[ends])
+    return np.asarray(away)
+
+
+def strays(xy: Array, seconds: Array | None) -> list[tuple[int, float]]:
+    """Positions [n, 2] off the track and by how many metres, the worst first; at most a quarter of them.
+
+    Near a wrong position right ones look wrong too: of it and its neighbours the one is meant without which the rest of
+    the track is smoothest. An error towards the next line, as far as that lies, is a possible track and not told.
+
+    Args:
+        xy: in the order of the flight.
+        seconds: when each was taken [n], increasing; None where unknown.
+    """
+
+    def away(kept: NDArray[np.int64]) -> Array:
+        return _away(xy[kept], None if seconds is None else seconds[kept])
+
+    kept = np.arange(len(xy))
+    # What is usual is told without the layout's answers: a track that turns all the time has no outliers.
+    limit = max(OFF_TRACK, TIMES_USUAL * float(np.median(_by_neighbours(xy, seconds))))
+    found: list[tuple[int, float]] = []
+    while len(kept) >= 6 and len(found) < len(xy) // 4:
+        now = away(kept)
+        worst = int(now.argmax())
+        if now[worst] <= limit:
+            break
+        near = kept[max(0, worst - 40) : worst + 41]
+        suspects = kept[max(0, worst - 2) : worst + 3].tolist()
+        left = [float(np.minimum(away(near[near != k]), 2 * limit).sum()) for k in suspects]
+        wrong = suspects[int(np.argmin(left))]
+        found.append((wrong, max(float(now[kept == wrong][0]), float(now[worst]))))
+        kept = kept[kept != wrong]
+    return sorted(found, key=lambda entry: -entry[1])
