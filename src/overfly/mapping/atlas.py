@@ -170,18 +170,18 @@ def paint(
     files, done = [], 0
     for page, (width, height) in enumerate(layout.sizes):
         canvas = np.empty((height, width, 3), np.uint8)
-        canvas[:] = np.asarray(ground, np.uint8)
+        canvas[:] = np.asarray(ground, np.uint8)[::-1]  # blue first: turning the page in the end would take it twice
         for i in [i for p, i in work if p == page]:
             full = pictures[i].size
             size = max(1, round(full[0] * layout.scale)), max(1, round(full[1] * layout.scale))
             image = pictures[i].read(size)
             for c in np.flatnonzero((layout.page == page) & (boxes.picture == i)):
                 (x, y), (w, h) = layout.place[c], boxes.size[c]
-                canvas[y : y + h, x : x + w] = _cut(image, boxes.corner[c], boxes.size[c])
+                canvas[y : y + h, x : x + w] = _cut(image, boxes.corner[c], boxes.size[c])[..., ::-1]
             done += 1
             if progress is not None:
                 progress(done, len(work))
-        good, data = cv2.imencode(".jpg", canvas[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        good, data = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
         assert good
         files.append(data.tobytes())
     return files

@@ -18,8 +18,7 @@ from overfly.geometry import Array, Camera, invert, project, rays, transform
 from overfly.mapping.visibility import View
 from overfly.mesh import Mesh
 from overfly.rendering.operations import interpolate, rasterise
-from overfly.rendering.render import Views
-from overfly.rendering.render import project as project_mesh
+from overfly.rendering.render import NEAR
 
 CANDIDATES = 8
 """Photographs remembered of each face, the best ones."""
@@ -51,6 +50,9 @@ GRAZING = 0.05
 
 FRONTAL = 3
 """Power of that cosine in the worth: the texture is off by the tangent of the angle times the error of the surface."""
+
+NOTHING = np.float32(3e38)
+"""Depth where there is no surface."""
 
 SAMPLES = np.array(
     [[0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9], [0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [1 / 3] * 3]
@@ -84,33 +86,31 @@ def rank_views(
         sharpness: [n] factors, see :class:`overfly.mapping.gains.Gains`.
         progress: told (done, in all).
     """
-    corners = mesh.vertices[mesh.faces]  # [F, 3, 3]
+    faces = np.asarray(mesh.faces, np.int32)
+    corners = mesh.vertices[faces]  # [F, 3, 3]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
-    smooth = _smoothed(mesh, across)
+    smooth, middle = _smoothed(mesh, across), corners.mean(1)
     cell = float(np.sqrt(np.median(np.abs(across[:, 2]))))  # side of the square that two faces make
-    vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(np.ascontiguousarray(mesh.faces, np.int32))
-    found = Candidates(
-        np.full((len(mesh.faces), CANDIDATES), -1, np.int32), np.zeros((len(mesh.faces), CANDIDATES), np.float32)
-    )
+    found = Candidates(np.full((len(faces), CANDIDATES), -1, np.int32), np.zeros((len(faces), CANDIDATES), np.float32))
     for i, view in enumerate(views):
         camera, pose = view.camera, view.world_from_camera
         assert camera is not None
         assert pose is not None
-        border = _border(mesh.vertices, camera, pose)
-        sight = pose[:3, 3] - corners.mean(1)
+        plane = _Plane(camera, pose)
+        local = transform(plane.camera_from_world, mesh.vertices)
+        near = plane.touched(local, faces)
+        sight = pose[:3, 3] - middle[near]
         distance = np.linalg.norm(sight, axis=1)
-        cosine = (normals * sight).sum(1) / distance
-        edge = border[mesh.faces].min(1)
-        mine = np.flatnonzero((edge > 0) & (cosine > GRAZING))
-        if len(mine):
-            buffer = _DepthBuffer(vertices, faces, camera, pose, cell)
-            seen, free = buffer.look(SAMPLES @ corners[mine])
-            mine, free = mine[seen], free[seen]
-            frontal = np.clip((smooth[mine] * sight[mine]).sum(1) / distance[mine], GRAZING, 1)
-            worth = frontal**FRONTAL * camera.fx / distance[mine] * np.clip(RAMP * edge[mine], 0, 1)
+        edge = _border(mesh.vertices[faces[near]], camera, pose)
+        front = (edge > 0) & ((normals[near] * sight).sum(1) > GRAZING * distance)
+        if front.any():
+            mine, sight, distance, edge = near[front], sight[front], distance[front], edge[front]
+            seen, free = plane.drawn(local, faces[near], cell).look(SAMPLES @ corners[mine])
+            frontal = np.clip((smooth[mine] * sight).sum(1) / distance, GRAZING, 1)
+            worth = frontal**FRONTAL * camera.fx / distance * np.clip(RAMP * edge, 0, 1)
             worth *= (BESIDE_EDGE + (1 - BESIDE_EDGE) * free) * np.clip(sharpness[i], 0.1, 1)
-            _keep_best(found, mine, i, worth.astype(np.float32))
+            _keep_best(found, mine[seen], i, worth[seen].astype(np.float32))
         if progress is not None:
             progress(i + 1, len(views))
     return found
@@ -129,49 +129,72 @@ def _smoothed(mesh: Mesh, across: Array, rounds: int = 2) -> Array:
     return face
 
 
-def _border(points: Array, camera: Camera, pose: Array) -> Array:
-    """Distance of points [N, 3] from the image's border as a share of its sides; at most 0 where outside."""
-    pixels, _ = project(points, camera, pose)
+def _border(corners: Array, camera: Camera, pose: Array) -> Array:
+    """Distance of faces [F, 3, 3] from the image's border as a share of its sides [F]; at most 0 where outside."""
+    pixels, _ = project(corners, camera, pose)
     size = np.array([camera.width, camera.height])
     with np.errstate(invalid="ignore"):
         inside = np.minimum(pixels - BORDER, size - BORDER - pixels) / size
-    return np.nan_to_num(inside.min(1), nan=-1.0)
+    return np.nan_to_num(inside.min((1, 2)), nan=-1.0)
+
+
+class _Plane:
+    """The ideal image plane of a camera, in pixels of a depth buffer: all that the image shows, without its lens."""
+
+    def __init__(self, camera: Camera, pose: Array) -> None:
+        border = rays(border_pixels(camera), camera)[:, :2]
+        border = border[np.isfinite(border).all(1)]  # a strong barrel has no rays at its corners
+        self.low = border.min(0)
+        extent = border.max(0) - self.low
+        self.focal, self.camera_from_world = BUFFER / extent.max(), invert(pose)
+        self.width, self.height = (int(n) for n in np.ceil(extent * self.focal))
+
+    def pixels(self, local: Array) -> Array:
+        """Column and row [..., 2] of points in camera axes [..., 3]; NaN nearer than :data:`NEAR`."""
+        depth = np.where(local[..., 2:] >= NEAR, local[..., 2:], np.nan)
+        return np.asarray((local[..., :2] / depth - self.low) * self.focal)
+
+    def touched(self, local: Array, faces: NDArray[np.int32]) -> NDArray[np.int64]:
+        """The faces of which the plane may show a part; vertices [V, 3] in camera axes."""
+        at = self.pixels(local)
+        beyond = np.stack([at[:, 0] >= 0, at[:, 1] >= 0, at[:, 0] < self.width, at[:, 1] < self.height], axis=1)
+        return np.flatnonzero((beyond[faces[:, 0]] | beyond[faces[:, 1]] | beyond[faces[:, 2]]).all(1))
+
+    def drawn(self, local: Array, faces: NDArray[np.int32], cell: float) -> _DepthBuffer:
+        """The depth buffer of faces [F, 3] over vertices [V, 3] in camera axes; ``cell``: side of the mesh's cells."""
+        at = self.pixels(local)
+        screen = np.nan_to_num(np.column_stack([at, 1 / local[:, 2]]) * np.isfinite(at[:, :1]))
+        x, y = (
+            (np.arange(n) + 0.5) / self.focal + low for n, low in zip((self.width, self.height), self.low, strict=True)
+        )
+        points, triangles = torch.from_numpy(local)[None], torch.from_numpy(faces)
+        face = rasterise(torch.from_numpy(screen)[None], triangles, (self.width, self.height))
+        through = torch.from_numpy(x)[None], torch.from_numpy(y)[None]
+        _, depth = interpolate(points, torch.zeros(len(local), 1), triangles, face, through)
+        depths = np.where(face[0].numpy() >= 0, depth[0].numpy(), NOTHING)
+        return _DepthBuffer(self, depths.astype(np.float32), cell)
 
 
 class _DepthBuffer:
-    """What a camera sees of a mesh, drawn without its lens; ``cell`` is the side of the mesh's cells."""
+    """Depths [rows, columns] of what a plane shows, :data:`NOTHING` where it shows nothing."""
 
-    def __init__(self, vertices: torch.Tensor, faces: torch.Tensor, camera: Camera, pose: Array, cell: float) -> None:
+    def __init__(self, plane: _Plane, depths: NDArray[np.float32], cell: float) -> None:
         import cv2
 
-        border = rays(border_pixels(camera), camera)[:, :2]
-        border = border[np.isfinite(border).all(1)]  # a strong barrel has no rays at its corners
-        self.low, self.cell = border.min(0), cell
-        extent = border.max(0) - self.low
-        self.focal, self.camera_from_world = BUFFER / extent.max(), invert(pose)
-        width, height = (int(n) for n in np.ceil(extent * self.focal))
-        x, y = -self.low * self.focal
-        matrix = torch.tensor([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]], dtype=torch.float64)
-        views = Views(matrix[None], torch.from_numpy(self.camera_from_world)[None], (width, height))
-        points, screen, through = project_mesh(vertices, views)
-        face = rasterise(screen, faces, views.size)
-        _, depth = interpolate(points, torch.zeros(len(vertices), 1), faces, face, through)
-        depths = depth[0].numpy()
-        depths[face[0].numpy() < 0] = 3e38
+        self.plane, self.cell = plane, cell
         # A pixel's centre at the edge of a roof may see the roof where the point beside it is free.
         self.farthest = cv2.dilate(depths, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-        drawn = depths[depths < 3e38]
-        hem = 2 * int(np.clip(cell * self.focal / np.median(drawn), *HEM)) + 1 if len(drawn) else 1
+        shown = depths[depths < NOTHING]
+        hem = 2 * int(np.clip(cell * plane.focal / np.median(shown), *HEM)) + 1 if len(shown) else 1
         self.nearest = cv2.erode(depths, np.ones((hem, hem), np.uint8), borderType=cv2.BORDER_REPLICATE)
 
     def look(self, points: Array) -> tuple[NDArray[np.bool_], Array]:
         """Of points [F, S, 3] of F faces: whether all are seen [F], and the share that stands free of edges [F]."""
-        local = transform(self.camera_from_world, points)
-        depth = local[..., 2]
-        column, row = np.moveaxis((local[..., :2] / depth[..., None] - self.low) * self.focal, -1, 0)
+        local = transform(self.plane.camera_from_world, points)
+        depth, (column, row) = local[..., 2], np.moveaxis(self.plane.pixels(local), -1, 0)
         rows, columns = self.farthest.shape
         place = np.clip(row, 0, rows - 1).astype(np.int64) * columns + np.clip(column, 0, columns - 1).astype(np.int64)
-        slack = SLACK * depth / self.focal
+        slack = SLACK * depth / self.plane.focal
         seen = (depth <= self.farthest.ravel()[place] + slack).all(1)
         free = depth <= self.nearest.ravel()[place] + np.maximum(slack, STEP * self.cell)
         return seen, free.mean(1)

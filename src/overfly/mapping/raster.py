@@ -176,19 +176,30 @@ def _fill(layers: NDArray[np.float64], passes: int) -> NDArray[np.float64]:
 
     A cell's neighbours are always added in the same order, so that it gets the same value in every window.
     """
-    rows, columns = layers.shape[:2]
-    around = [(down, right) for down in range(3) for right in range(3) if (down, right) != (1, 1)]
+    if not passes:
+        return layers
+    padded = np.pad(layers, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+    known = np.isfinite(padded[..., 0]).ravel()
+    empty = ~known  # cells that may be filled: the padding may not
+    empty.reshape(padded.shape[:2])[[0, -1]] = empty.reshape(padded.shape[:2])[:, [0, -1]] = False
+    flat, width = padded.reshape(-1, padded.shape[2]), padded.shape[1]
+    around = [width * down + right for down in (-1, 0, 1) for right in (-1, 0, 1) if (down, right) != (0, 0)]
+    asked = np.flatnonzero(empty)
     for _ in range(passes):
-        padded = np.pad(layers, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-        known = np.isfinite(padded[..., 0])
-        count = np.zeros((rows, columns), np.int8)
-        for down, right in around:
-            count += known[down : down + rows, right : right + columns]
-        at_row, at_column = np.nonzero(~known[1:-1, 1:-1] & (count >= 3))
-        total = np.zeros((len(at_row), layers.shape[2]))
-        for down, right in around:
-            beside = padded[at_row + down, at_column + right]
+        count = np.zeros(len(asked), np.int8)
+        for step in around:
+            count += known[asked + step]
+        at, count = asked[count >= 3], count[count >= 3]
+        if not len(at):
+            break
+        total = np.zeros((len(at), flat.shape[1]))
+        for step in around:
+            beside = flat[at + step]
             total += np.where(np.isfinite(beside[:, :1]), beside, 0.0)
-        layers = padded[1:-1, 1:-1]
-        layers[at_row, at_column] = total / count[at_row, at_column, None]
-    return layers
+        flat[at] = total / count[:, None]
+        known[at], empty[at] = True, False
+        near = np.zeros(len(known), bool)  # only beside a cell that was just filled may another one be
+        for step in around:
+            near[at + step] = True
+        asked = np.flatnonzero(near & empty)
+    return padded[1:-1, 1:-1]
