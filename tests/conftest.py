@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -21,3 +22,35 @@ def shared_data() -> Callable[[str], Path]:
         return path
 
     return folder
+
+
+def undulation(longitude: float) -> float:
+    """Height of the sea above the ellipsoid in the grid of ``geoid``, metres."""
+    return 40.0 + (longitude + 180.0) / 36.0
+
+
+@pytest.fixture
+def geoid(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[float], float]]:
+    """PROJ finds a grid for EGM96, coarse and made up; the value is :func:`undulation`."""
+    import pyproj
+    import rasterio
+    from rasterio.transform import Affine
+
+    from overfly import geodesy
+
+    folder = tmp_path_factory.mktemp("proj")
+    values = np.tile(np.float32([undulation(x) for x in range(-180, 181)]), (181, 1))
+    size = {"width": 361, "height": 181, "count": 1, "dtype": "float32"}
+    grid = folder / "us_nga_egm96_15.tif"
+    place = Affine(1, 0, -180.5, 0, -1, 90.5)
+    with rasterio.open(grid, "w", driver="GTiff", crs="EPSG:4326", transform=place, **size) as file:
+        file.write(values, 1)
+        file.update_tags(AREA_OR_POINT="Point", TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL")
+        file.set_band_description(1, "geoid_undulation")
+        file.set_band_unit(1, "metre")
+    usual = pyproj.datadir.get_data_dir()
+    geodesy._projected.cache_clear()
+    pyproj.datadir.append_data_dir(str(folder))
+    yield undulation
+    pyproj.datadir.set_data_dir(usual)
+    geodesy._projected.cache_clear()

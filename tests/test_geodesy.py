@@ -84,3 +84,38 @@ def test_utm_zones(latitude: float, longitude: float, epsg: int) -> None:
 def test_origins_off_the_earth_are_refused(latitude: float, longitude: float) -> None:
     with pytest.raises(InputError, match="latitude -90 to 90"):
         geodesy.Origin(latitude, longitude)
+
+
+@pytest.mark.parametrize("place", [(46.0, 8.0, 450.0), (-33.9, 151.25, 30.0)])
+def test_heights_above_the_sea_are_lower_by_the_geoid(geoid, place: tuple[float, float, float]) -> None:  # type: ignore[no-untyped-def]
+    code = geodesy.vertical_crs("egm96")
+    assert code == 5773
+    origin = geodesy.Origin(*place, vertical_epsg=code)
+    points = np.array([[0.0, 0, 0], [500, -300, 40]])
+    above_sea = geodesy.crs_from_enu(points, origin)
+    above_ellipsoid = geodesy.crs_from_enu(points, geodesy.Origin(*place))
+    assert_allclose(above_ellipsoid[0, 2] - above_sea[0, 2], geoid(place[1]), atol=1e-3)
+    assert_allclose(above_sea[:, :2], above_ellipsoid[:, :2], atol=1e-6)
+    assert_allclose(geodesy.enu_from_crs(above_sea, origin), points, atol=1e-5)
+    assert_allclose(geodesy.enu_from_crs(above_ellipsoid, origin, origin.crs_epsg), points, atol=1e-5)
+
+
+def test_a_missing_geoid_grid_is_named_and_never_passed_over() -> None:
+    with pytest.raises(InputError, match=r"us_nga_egm96_15\.tif, which is not on this machine: copy it from"):
+        geodesy.vertical_crs("egm96")
+    with pytest.raises(InputError, match=r"need the geoid grid us_nga_egm96_15\.tif"):
+        geodesy.crs_from_enu([[0, 0, 0]], geodesy.Origin(46.0, 8.0, 450.0, vertical_epsg=5773))
+    with pytest.raises(InputError, match=r"EPSG:5701|uk_os_OSGM15_GB"):
+        geodesy.vertical_crs("EPSG:5701")
+
+
+@pytest.mark.parametrize("text", ["sea", "EPSG:4326", "32632", "6360", ""])
+def test_what_is_no_vertical_crs_in_metres_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="are not known: give ellipsoidal, egm96, egm2008, or the EPSG code"):
+        geodesy.vertical_crs(text)
+
+
+def test_ellipsoidal_heights_have_no_vertical_crs() -> None:
+    assert geodesy.vertical_crs("Ellipsoidal") is None
+    assert geodesy.crs_code(32632) == "EPSG:32632"
+    assert geodesy.crs_code(32632, 5773) == "EPSG:32632+5773"

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.files import existing, replacing
+from overfly.geodesy import crs_code
 from overfly.ply import read_ply, write_ply_tables
 
 SUFFIXES = (".ply", ".las", ".laz")
@@ -39,7 +40,8 @@ class Cloud:
         sigma_m: [N] float32, standard deviation of the position in metres, or None.
         views: [N] uint8, number of frames that measured the point, or None.
         predicted: [N] bool, True where fewer than two frames support the point, or None.
-        epsg: CRS of the points, None for a local frame.
+        epsg: projected CRS of the points, None for a local frame.
+        vertical_epsg: vertical CRS of their heights, None where they are above the ellipsoid or not said.
     """
 
     points: NDArray[np.float64]
@@ -49,19 +51,29 @@ class Cloud:
     views: NDArray[np.uint8] | None = None
     predicted: NDArray[np.bool_] | None = None
     epsg: int | None = None
+    vertical_epsg: int | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def crs(self) -> str | None:
+        """The CRS as PROJ calls it, ``EPSG:32632``, with a vertical one ``EPSG:32632+5773``; None of a local frame."""
+        return None if self.epsg is None else crs_code(self.epsg, self.vertical_epsg)
+
     def __getitem__(self, index: NDArray | slice) -> Cloud:
         """The points that ``index`` (a mask, integers or a slice) selects, with all their attributes."""
-        arrays: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "epsg"}
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in ARRAYS}
         arrays = {name: None if array is None else array[index] for name, array in arrays.items()}
-        return Cloud(**(arrays | {"epsg": self.epsg}))
+        return replace(self, **arrays)
 
-    def with_points(self, points: NDArray, epsg: int | None = None) -> Cloud:
-        """The same attributes at other coordinates."""
-        return replace(self, points=np.asarray(points, np.float64), epsg=epsg)
+    def with_points(self, points: NDArray, epsg: int | None = None, vertical_epsg: int | None = None) -> Cloud:
+        """The same attributes at other coordinates, in another CRS."""
+        return replace(self, points=np.asarray(points, np.float64), epsg=epsg, vertical_epsg=vertical_epsg)
+
+
+ARRAYS = tuple(f.name for f in fields(Cloud) if not f.name.endswith("epsg"))
+"""The attributes that have a value for each point."""
 
 
 def voxel_thin(points: NDArray, size_m: float) -> NDArray[np.int64]:
@@ -77,14 +89,15 @@ def voxel_thin(points: NDArray, size_m: float) -> NDArray[np.int64]:
 
 def concatenate(clouds: list[Cloud]) -> Cloud:
     """All points of several clouds that share a frame of reference; attributes missing from any one are dropped."""
-    if len({c.epsg for c in clouds}) > 1:
-        raise InputError(f"Clouds in different CRS cannot be joined: EPSG {sorted({str(c.epsg) for c in clouds})}.")
+    if len({c.crs for c in clouds}) > 1:
+        raise InputError(
+            f"Clouds in different CRS cannot be joined: {', '.join(sorted({str(c.crs) for c in clouds}))}."
+        )
     joined: dict[str, Any] = {}
-    for f in fields(Cloud):
-        values = [getattr(c, f.name) for c in clouds]
-        if f.name != "epsg":
-            joined[f.name] = None if any(v is None for v in values) else np.concatenate(values)
-    return Cloud(**joined, epsg=clouds[0].epsg)
+    for name in ARRAYS:
+        values = [getattr(c, name) for c in clouds]
+        joined[name] = None if any(v is None for v in values) else np.concatenate(values)
+    return replace(clouds[0], **joined)
 
 
 def read_cloud(path: Path | str) -> Cloud:
@@ -158,19 +171,22 @@ def _read_ply(path: Path) -> Cloud:
         if set(names) <= columns.keys():
             colors = np.stack([_as_uint8(columns[name]) for name in names], axis=1)
             break
-    epsg = [int(c.split()[1]) for c in ply.comments if c.startswith("epsg ") and c.split()[1].isdigit()]
+    said = {c.split()[0]: c.split()[1] for c in ply.comments if len(c.split()) == 2}
+    epsg, vertical_epsg = (int(v) if (v := said.get(k, "")).isdigit() else None for k in ("epsg", "vertical_epsg"))
     return Cloud(
         np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1),
         colors,
         **_attributes({name: columns[name] for name in EXTRAS if name in columns}),
-        epsg=epsg[0] if epsg else None,
+        epsg=epsg,
+        vertical_epsg=vertical_epsg,
     )
 
 
 def _write_ply(clouds: Iterator[Cloud], path: Path, count: int, low: NDArray) -> None:
     first = next(clouds)
     tables = (_columns(cloud) for cloud in chain([first], clouds))
-    write_ply_tables(path, tables, count, comments=(f"epsg {first.epsg}",) if first.epsg else ())
+    comments = [f"{k} {code}" for k in ("epsg", "vertical_epsg") if (code := getattr(first, k))]
+    write_ply_tables(path, tables, count, comments=comments)
 
 
 def _columns(cloud: Cloud) -> dict[str, NDArray]:
@@ -204,16 +220,18 @@ def _read_las(path: Path) -> Cloud:
         # The standard asks for 16 bits, yet many programs write 8-bit values.
         colors = (deep >> 8 if deep.size and deep.max() > 255 else deep).astype(np.uint8)
         colors = colors if deep.any() else None
+    epsg, vertical_epsg = _crs(las.header, path)
     return Cloud(
         np.stack([np.asarray(las.x), np.asarray(las.y), np.asarray(las.z)], axis=1).astype(np.float64),
         colors,
         **_attributes({name: np.asarray(las[name]) for name in EXTRAS if name in names}),
-        epsg=_epsg(las.header, path),
+        epsg=epsg,
+        vertical_epsg=vertical_epsg,
     )
 
 
-def _epsg(header: Any, path: Path) -> int | None:
-    """The EPSG code in a LAS header; None without a CRS or code: then the frame counts as local."""
+def _crs(header: Any, path: Path) -> tuple[int | None, int | None]:
+    """The EPSG codes in a LAS header, horizontal and vertical; None without a CRS or code: then the frame is local."""
     from pyproj.exceptions import CRSError
 
     try:
@@ -221,15 +239,15 @@ def _epsg(header: Any, path: Path) -> int | None:
     except CRSError as error:
         raise InputError(f"The CRS in the header of {path} is not readable ({error}): write it again.") from error
     if crs is None:
-        return None
-    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+        return None, None
+    horizontal, vertical = crs.sub_crs_list if crs.is_compound else (crs, None)
     if units := {a.unit_name for a in crs.axis_info} - {"metre", "meter"}:
         raise InputError(
             f"{path} is in {horizontal.name}, whose unit is {', '.join(sorted(units))}; Overfly works in metres: "
             "reproject it first, for example with `pdal translate in.laz out.laz reprojection "
             "--filters.reprojection.out_srs=EPSG:32610` and the UTM zone of the place."
         )
-    return horizontal.to_epsg()
+    return horizontal.to_epsg(), None if vertical is None else vertical.to_epsg()
 
 
 def _write_las(clouds: Iterator[Cloud], path: Path, count: int, low: NDArray) -> None:
@@ -241,8 +259,8 @@ def _write_las(clouds: Iterator[Cloud], path: Path, count: int, low: NDArray) ->
     header.scales = np.full(3, 0.001)
     header.offsets = np.floor(low)
     header.generating_software = "Overfly"
-    if first.epsg:
-        header.add_crs(CRS.from_epsg(first.epsg))
+    if first.crs:
+        header.add_crs(CRS.from_user_input(first.crs))
     kept = [name for name in EXTRAS if getattr(first, name) is not None]
     header.add_extra_dims([laspy.ExtraBytesParams(name, EXTRAS[name]) for name in kept])
     with replacing(path) as temporary, laspy.open(temporary, mode="w", header=header) as las:

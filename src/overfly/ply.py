@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -70,7 +70,7 @@ def write_ply(
     path: Path | str,
     columns: dict[str, NDArray],
     faces: NDArray | None = None,
-    comments: tuple[str, ...] = (),
+    comments: Sequence[str] = (),
 ) -> None:
     """Write a binary little-endian PLY file, atomically; a column keeps its type."""
     count = len(next(iter(columns.values())))
@@ -82,7 +82,7 @@ def write_ply_tables(
     tables: Iterable[dict[str, NDArray]],
     count: int,
     faces: NDArray | None = None,
-    comments: tuple[str, ...] = (),
+    comments: Sequence[str] = (),
 ) -> None:
     """As :func:`write_ply`, of vertices that come in several tables of the same columns, ``count`` in all."""
     with replacing(path) as temporary, temporary.open("wb") as file:

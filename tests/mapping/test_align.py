@@ -54,7 +54,7 @@ def kept(block, work, tmp_path: Path) -> Path:  # type: ignore[no-untyped-def]
 
 @pytest.mark.parametrize("size", [(800, 600), (600, 800), (5472, 3648), (1600, 900)])
 def test_an_image_of_another_shape_than_the_sensor_is_a_part_of_it(size: tuple[int, int]) -> None:
-    """An 11 % wrong focal length bends the whole block: 4:3 cut out of a 3:2 sensor must not count as its full width."""
+    """4:3 cut out of a 3:2 sensor must not count as its full width: 11 % of the focal length bend the whole block."""
     frame = Frame("a", Path("a"), *size, model="FC6310", focal_mm=8.8)
     across, down = (max(size) / 13.2, min(size) / 8.8)
     assert focal_px(frame) == pytest.approx(8.8 * max(across, down))

@@ -133,13 +133,12 @@ def _origin(block: Any, path: Path) -> Origin | None:
         return None
     try:
         numbers = [float(block["latitude"]), float(block["longitude"]), float(block.get("height", 0.0))]
-        epsg = block.get("epsg")
-        epsg = None if epsg is None else int(epsg)
+        epsg, vertical = (None if block.get(k) is None else int(block[k]) for k in ("epsg", "vertical_epsg"))
     except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise InputError(f"The origin in {path} must have latitude, longitude and height as numbers.") from error
     if not all(math.isfinite(n) for n in numbers):
         raise InputError(f"The origin in {path} holds NaN or infinity: give degrees and metres.")
-    return Origin(numbers[0], numbers[1], numbers[2], epsg)
+    return Origin(numbers[0], numbers[1], numbers[2], epsg, vertical)
 
 
 def write_transforms(
@@ -172,7 +171,9 @@ def write_transforms(
     block: dict[str, Any] = dict(facts or {})
     if origin is not None:
         height = {"latitude": origin.latitude, "longitude": origin.longitude, "height": origin.height}
-        block = {"origin": height | {"epsg": origin.crs_epsg}} | {k: v for k, v in block.items() if k != "origin"}
+        crs = {"epsg": origin.crs_epsg}
+        crs |= {} if origin.vertical_epsg is None else {"vertical_epsg": origin.vertical_epsg}
+        block = {"origin": height | crs} | {k: v for k, v in block.items() if k != "origin"}
     if block:
         data["overfly"] = block
     text = json.dumps(data, indent=1, allow_nan=False)

@@ -154,8 +154,8 @@ def _held_block(
         if origin is not None:
             ruled = controlled(flight, result, origin, with_gps=at is not None, how=control, warnings=warnings)
             result = ruled.adjusted
-            if ruled.used and ruled.epsg is not None:
-                origin = replace(origin, epsg=ruled.epsg)
+            if ruled.used and ruled.crs[0] is not None:
+                origin = replace(origin, epsg=ruled.crs[0], vertical_epsg=ruled.crs[1])
     metric = at is not None or (ruled is not None and ruled.used)
     if not metric:
         origin = None

@@ -47,6 +47,12 @@ def _about_place(summary: Mapping[str, Any], has_gps: bool) -> Iterator[Caution]
             "The map has no place on the Earth: it is in the cameras' own frame and the files carry no CRS.",
             "Give the origin in transforms.json (key overfly.origin) if it should lie in a GIS.",
         )
+    if summary["heights"] == "ellipsoid":
+        yield Caution(
+            "Heights are those of the origin or the images' GPS, taken as above the ellipsoid: no geoid is applied.",
+            "For heights above the sea map with --heights egm96 or the EPSG code of a vertical CRS, for which PROJ "
+            "needs its geoid grid; or give ground control.",
+        )
     if not has_gps and summary["cameras_from"] == "estimated":
         yield Caution(
             "No image carries a usable GPS position.",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.flights import ControlPoint, Flight
-from overfly.geodesy import Origin, enu_from_geodetic
+from overfly.geodesy import Origin, enu_from_geodetic, vertical_crs
 from overfly.geometry import Array, fit_similarity, transform
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.clicks import Control
@@ -34,37 +34,52 @@ def control_origin(points: Sequence[ControlPoint]) -> Origin | None:
         return None
     geodetic = np.array([_geodetic(point) for point in points])
     latitude, longitude, height = (float(v) for v in np.median(geodetic, axis=0))
-    return Origin(latitude, longitude, height, projected_epsg(points[0].crs))
+    return Origin(latitude, longitude, height, *control_crs(points[0].crs))
 
 
-def projected_epsg(crs: str) -> int | None:
-    """EPSG code of a projected CRS in metres, None for any other."""
+def control_crs(text: str) -> tuple[int | None, int | None]:
+    """EPSG codes of the projected CRS in metres and of the vertical CRS in metres of a control file's first line.
+
+    None of both where there is none; heights then are taken as they are.
+    """
     from pyproj import CRS
 
     from overfly.flights.odm import crs_name
 
-    found = CRS.from_user_input(crs_name(crs))
-    metres = found.is_projected and all(axis.unit_name == "metre" for axis in found.axis_info[:2])
-    return found.to_epsg() if metres else None
+    crs = CRS.from_user_input(crs_name(text))
+    horizontal, vertical = crs.sub_crs_list if crs.is_compound else (crs, None)
+    metres = horizontal.is_projected and all(axis.unit_name == "metre" for axis in horizontal.axis_info[:2])
+    return horizontal.to_epsg() if metres else None, None if vertical is None else vertical.to_epsg()
 
 
 def _geodetic(point: ControlPoint) -> tuple[float, float, float]:
-    from pyproj import Transformer
+    from pyproj import CRS, Transformer
     from pyproj.exceptions import ProjError
 
     from overfly.flights.odm import crs_name
 
     x, y, z = point.position
     try:
-        longitude, latitude = Transformer.from_crs(crs_name(point.crs), "EPSG:4326", always_xy=True).transform(
-            x, y, errcheck=True
-        )
+        crs = CRS.from_user_input(crs_name(point.crs))
+        if not crs.is_compound:
+            place = Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform(x, y, errcheck=True)
+            return place[1], place[0], z
     except ProjError as error:
         raise InputError(
             f"The first line of gcp_list.txt must be a CRS that fits the coordinates, such as EPSG:32617, not "
             f"{point.crs!r} ({str(error).splitlines()[0]})."
         ) from error
-    return latitude, longitude, z
+    vertical = crs.sub_crs_list[1].to_epsg()
+    vertical_crs(str(vertical))  # says which grid is missing
+    try:
+        way = Transformer.from_crs(crs, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True)
+        longitude, latitude, height = way.transform(x, y, z, errcheck=True)
+    except ProjError as error:
+        raise InputError(
+            f"The height of {point.name} in gcp_list.txt cannot be taken from EPSG:{vertical} to the ellipsoid "
+            f"({str(error).splitlines()[0]}): check its coordinates and the CRS."
+        ) from error
+    return latitude, longitude, height
 
 
 def read_controls(flight: Flight, bundle: Bundle, origin: Origin, warnings: list[str]) -> list[Control]:

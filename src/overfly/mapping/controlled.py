@@ -19,8 +19,8 @@ from overfly.mapping.control import (
     FEWEST_TO_TELL_HEIGHTS,
     checks_of,
     consistent,
+    control_crs,
     flat,
-    projected_epsg,
     read_controls,
     spread_m,
 )
@@ -38,13 +38,14 @@ ROUNDS = 3
 
 @dataclass(frozen=True, eq=False)
 class Controlled:
-    """The outcome: the adjustment (its last ``added`` points are controls), the survey, whether any control held it."""
+    """The outcome: the adjustment (its last ``added`` points are controls), the survey, whether any control held it,
+    and the EPSG codes of the controls' projected and vertical CRS."""
 
     adjusted: Adjusted
     survey: Survey
     added: int = 0
     used: bool = False
-    epsg: int | None = None
+    crs: tuple[int | None, int | None] = (None, None)
 
 
 def placed_by_controls(flight: Flight, result: Adjusted, origin: Origin, warnings: list[str]) -> Adjusted:
@@ -123,7 +124,7 @@ def controlled(
         (round(float(sigma[0]), 4), round(float(sigma[1]), 4)),
         None if shift is None else (round(east, 3), round(north, 3), round(up, 3)),
     )
-    return Controlled(final, survey, len(views), True, projected_epsg(flight.gcps[0].crs))
+    return Controlled(final, survey, len(views), True, control_crs(flight.gcps[0].crs))
 
 
 def _weighed(

@@ -24,6 +24,7 @@ from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
 from overfly.mapping.gains import Gains
 from overfly.mapping.gallery import gallery, upright
+from overfly.mapping.heights import heights_of
 from overfly.mapping.orthophoto import Orthophoto
 from overfly.mapping.products import SAMPLE, WINDOW, raster_products
 from overfly.mapping.raster import Grid, Surface
@@ -191,6 +192,7 @@ def summarise(
         "predicted": counted["predicted"],
         "gsd_m": round(counted["gsd"], 5) if block.metric else None,
         "crs": crs,
+        "heights": heights_of(block),
         "cameras_from": block.cameras_from,
         "seconds": steps.seconds,
         "peak_memory_mb": round(peak_memory_mb(), 1),

@@ -14,8 +14,10 @@ import numpy as np
 from overfly import __version__
 from overfly.errors import InputError
 from overfly.flights import Flight, read_flight
+from overfly.geodesy import crs_code
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
+from overfly.mapping.heights import with_heights
 from overfly.mapping.needs import Budget, allowed_gb, budget, least_gb
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import SIZE, MapSettings
@@ -110,6 +112,7 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
         write_block,
         lambda folder: read_block(folder, flight),
     )
+    block = with_heights(block, asked.heights)
     steps.say("cameras", _about_block(block, flight))
     return block, key
 
@@ -257,7 +260,7 @@ def _about_block(block: Block, flight: Flight) -> str:
     if block.reprojection_px is not None:
         text += f", {block.reprojection_px:.2f} px"
     if block.origin is not None and block.metric:
-        return f"{text}, EPSG:{block.origin.crs_epsg}"
+        return f"{text}, {crs_code(block.origin.crs_epsg, block.origin.vertical_epsg)}"
     return f"{text}, local frame" if block.metric else f"{text}, metric scale unknown"
 
 

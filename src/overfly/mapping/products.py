@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from overfly.cloud import Cloud, concatenate
 from overfly.errors import InputError
 from overfly.files import replacing
+from overfly.geodesy import crs_code
 from overfly.mapping.raster import Grid, grid_over, surface
 from overfly.mapping.tiles import Tiles
 
@@ -71,7 +72,7 @@ def raster_products(
     """Write ``dsm.tif`` and ``orthophoto.tif`` beside each other, as cloud-optimised GeoTIFFs.
 
     Args:
-        cloud: coloured points; their ``epsg`` becomes the files' CRS, None writes none.
+        cloud: coloured points; their CRS becomes the files', the vertical one only the surface model's.
         out: folder.
         gsd: ground sampling distance in the cloud's unit; see :func:`cell_size`.
         fill: passes that close gaps of single cells.
@@ -95,16 +96,16 @@ def raster_products(
             f"The surface would have {grid.rows} x {grid.columns} cells of {grid.cell:.3g}: the cloud's extent "
             "does not fit its resolution; check the cameras for strays."
         )
-    photo = out / "orthophoto.tif"
-    with _raster(out / "dsm.tif", grid, few.epsg, 1, "float32", nodata=NODATA) as heights:
+    photo, level = out / "orthophoto.tif", None if few.epsg is None else crs_code(few.epsg)
+    with _raster(out / "dsm.tif", grid, few.crs, 1, "float32", nodata=NODATA) as heights:
         if painter is None and few.colors is not None:
-            with _raster(photo, grid, few.epsg, 4, "uint8") as colors:
+            with _raster(photo, grid, level, 4, "uint8") as colors:
                 _draw(cloud, grid, fill, window, heights, colors)
         else:
             _draw(cloud, grid, fill, window, heights, None)
         if painter is not None:
             parts = max(1, round(grid.cell / gsd))
-            _paint(heights, grid, painter, grid.cell / parts, photo, few.epsg, window)
+            _paint(heights, grid, painter, grid.cell / parts, photo, level, window)
     return grid
 
 
@@ -212,7 +213,7 @@ def _points_in(cloud: Tiles, grid: Grid) -> Cloud:
     return concatenate(found)
 
 
-def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path, epsg: int | None, cells: int) -> None:
+def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path, crs: str | None, cells: int) -> None:
     """Write the orthophoto in the colours of a painter, from the surface model that was written before."""
     known = OVERVIEW * grid.cell
     rows, columns = -(-grid.rows // OVERVIEW), -(-grid.columns // OVERVIEW)
@@ -228,7 +229,7 @@ def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path
     size = int(np.ceil((top - y_min) / cell - 1e-6)), int(np.ceil((x_max - left) / cell - 1e-6))
     fine = Grid(float(left), float(top), cell, *size)
     margin = int(np.ceil(painter.halo(cell) / grid.cell)) + 2
-    with _raster(path, fine, epsg, 4, "uint8") as photo:
+    with _raster(path, fine, crs, 4, "uint8") as photo:
         for window in windows(fine, cells):
             around = _over(grid, window.grid).wide(margin)
             below = heights.read(1, window=around.place)
@@ -252,7 +253,7 @@ def _bands(colors: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.ui
 
 @contextmanager
 def _raster(
-    path: Path, grid: Grid, epsg: int | None, count: int, kind: str, *, nodata: float | None = None
+    path: Path, grid: Grid, crs: str | None, count: int, kind: str, *, nodata: float | None = None
 ) -> Iterator[Any]:
     """A plain GeoTIFF to write windows into, which becomes a cloud-optimised one with overviews, atomically.
 
@@ -273,7 +274,7 @@ def _raster(
             height=grid.rows,
             count=count,
             dtype=kind,
-            crs=None if epsg is None else f"EPSG:{epsg}",
+            crs=crs,
             transform=Affine(grid.cell, 0.0, grid.x_min, 0.0, -grid.cell, grid.y_max),
             nodata=nodata,
             tiled=True,

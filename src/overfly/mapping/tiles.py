@@ -11,7 +11,7 @@ import os
 import shutil
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.cloud import Cloud, concatenate
+from overfly.cloud import ARRAYS, Cloud, concatenate
 from overfly.errors import Damaged
 from overfly.files import load_arrays, replacing, save_arrays
 
-ATTRIBUTES = tuple(f.name for f in fields(Cloud) if f.name != "epsg")
 INDEX = "index.json"
 HELD = 3
 """Tiles in memory at once: what reads a map row by row comes back to the ones below."""
@@ -38,7 +37,7 @@ class Tile:
         points, predicted: how many it has, and how many of them are predicted.
         low, high: its bounds [3].
         crc32: of the file.
-        epsg: CRS of the points, None for a local frame.
+        epsg, vertical_epsg: CRS of the points, see :class:`overfly.cloud.Cloud`.
     """
 
     file: str
@@ -48,6 +47,7 @@ class Tile:
     high: tuple[float, ...] = ()
     crc32: int = 0
     epsg: int | None = None
+    vertical_epsg: int | None = None
 
 
 class Tiles:
@@ -73,7 +73,8 @@ class Tiles:
         return (read(i) for i in range(len(self.tiles)))
 
     def _read(self, i: int) -> Cloud:
-        cloud = Cloud(**load_arrays(self.folder / self.tiles[i].file), epsg=self.tiles[i].epsg)
+        tile = self.tiles[i]
+        cloud = Cloud(**load_arrays(self.folder / tile.file), epsg=tile.epsg, vertical_epsg=tile.vertical_epsg)
         return cloud if self.change is None else self.change(cloud)
 
     @property
@@ -119,10 +120,10 @@ def write_tile(folder: Path, name: str, cloud: Cloud) -> Tile:
     tile = Tile("")
     if len(cloud):
         path = folder / f"{name}.npz"
-        save_arrays(path, {n: getattr(cloud, n) for n in ATTRIBUTES if getattr(cloud, n) is not None})
+        save_arrays(path, {n: getattr(cloud, n) for n in ARRAYS if getattr(cloud, n) is not None})
         predicted = 0 if cloud.predicted is None else int(cloud.predicted.sum())
         low, high = (tuple(float(v) for v in end) for end in (cloud.points.min(0), cloud.points.max(0)))
-        tile = Tile(path.name, len(cloud), predicted, low, high, _crc32(path), cloud.epsg)
+        tile = Tile(path.name, len(cloud), predicted, low, high, _crc32(path), cloud.epsg, cloud.vertical_epsg)
     _write_json(folder / f"{name}.json", asdict(tile))
     return tile
 

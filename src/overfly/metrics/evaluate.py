@@ -106,6 +106,7 @@ def evaluate(
         "clip_m": float(clip) if np.isfinite(clip) else None,
         "seed": seed,
         "epsg": wanted.epsg,
+        "vertical_epsg": wanted.vertical_epsg,
         "warnings": warnings,
     }
 
@@ -162,44 +163,51 @@ def _placed(
 ) -> tuple[Cloud, Cloud, list[str]]:
     """A cloud of a flight folder (local ENU) in the other's CRS, by the origin that its transforms.json states."""
     said: list[str] = []
-    if cloud.epsg and not reference.epsg and (origin := _origin_beside(reference_file, cloud.epsg)):
-        reference = reference.with_points(crs_from_enu(reference.points, origin), epsg=cloud.epsg)
-        said = [f"The reference was brought from its flight's local frame to EPSG:{cloud.epsg}."]
-    elif reference.epsg and not cloud.epsg and (origin := _origin_beside(cloud_file, reference.epsg)):
-        cloud = cloud.with_points(crs_from_enu(cloud.points, origin), epsg=reference.epsg)
-        said = [f"The cloud was brought from its flight's local frame to EPSG:{reference.epsg}."]
+    if cloud.epsg and not reference.epsg and (origin := _origin_beside(reference_file, cloud)):
+        reference = reference.with_points(crs_from_enu(reference.points, origin), cloud.epsg, cloud.vertical_epsg)
+        said = [f"The reference was brought from its flight's local frame to {cloud.crs}."]
+    elif reference.epsg and not cloud.epsg and (origin := _origin_beside(cloud_file, reference)):
+        cloud = cloud.with_points(crs_from_enu(cloud.points, origin), reference.epsg, reference.vertical_epsg)
+        said = [f"The cloud was brought from its flight's local frame to {reference.crs}."]
     return cloud, reference, said
 
 
-def _origin_beside(file: Path | str | Cloud, epsg: int) -> Origin | None:
-    """The origin in the transforms.json that lies in the same folder, with the CRS to go to; None without one."""
+def _origin_beside(file: Path | str | Cloud, other: Cloud) -> Origin | None:
+    """The origin in the transforms.json that lies beside a file, with the other's CRS to go to; None without one."""
     if isinstance(file, Cloud) or not (transforms := Path(file).parent / "transforms.json").is_file():
         return None
     stated = json.loads(transforms.read_text()).get("overfly", {}).get("origin")
     if not stated:
         return None
-    return Origin(stated["latitude"], stated["longitude"], stated.get("height") or 0.0, epsg)
+    return Origin(stated["latitude"], stated["longitude"], stated.get("height") or 0.0, other.epsg, other.vertical_epsg)
 
 
 def _check_frames(cloud: Cloud, reference: Cloud, mode: str) -> list[str]:
     """Refuse clouds that cannot be in one frame; say what was taken for granted."""
-    if cloud.epsg == reference.epsg:
+    if cloud.crs == reference.crs:
         return []
-    if cloud.epsg and reference.epsg:
+    if cloud.epsg == reference.epsg and None in (cloud.vertical_epsg, reference.vertical_epsg) and mode == "none":
+        return [
+            f"The cloud is in {cloud.crs}, the reference in {reference.crs}: heights over ellipsoid and sea differ by "
+            "up to 100 m; give both the same vertical CRS (overfly map --heights), or add --align shift."
+        ]
+    if cloud.epsg and reference.epsg and not (cloud.epsg == reference.epsg and mode != "none"):
         raise InputError(
-            f"The cloud is in EPSG:{cloud.epsg}, the reference in EPSG:{reference.epsg}: reproject one of them, "
+            f"The cloud is in {cloud.crs}, the reference in {reference.crs}: reproject one of them, "
             "they can only be compared in the same CRS."
         )
-    local, other, epsg = ("cloud", "reference", reference.epsg)
+    local, other, crs = ("cloud", "reference", reference.crs)
+    if cloud.epsg and reference.epsg:
+        return [f"The cloud is in {cloud.crs}, the reference in {crs}; they were laid upon each other by {mode}."]
     if cloud.epsg:
-        local, other, epsg = ("reference", "cloud", cloud.epsg)
+        local, other, crs = ("reference", "cloud", cloud.crs)
     if mode != "none":
-        return [f"The {local} has no CRS, the {other} is in EPSG:{epsg}; they were laid upon each other by {mode}."]
+        return [f"The {local} has no CRS, the {other} is in {crs}; they were laid upon each other by {mode}."]
     a, b = cloud.points[:, :2], reference.points[:, :2]
     if (a.min(0) <= b.max(0)).all() and (a.max(0) >= b.min(0)).all():
-        return [f"The {local} names no CRS; it was taken to be in that of the {other}, EPSG:{epsg}, where it lies."]
+        return [f"The {local} names no CRS; it was taken to be in that of the {other}, {crs}, where it lies."]
     raise InputError(
-        f"The {local} has no CRS and does not lie where the {other} does (EPSG:{epsg}): give both in one frame, "
+        f"The {local} has no CRS and does not lie where the {other} does ({crs}): give both in one frame, "
         "or add --align shift, rigid or similarity."
     )
 

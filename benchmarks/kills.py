@@ -1,0 +1,92 @@
+"""A map that is killed at random moments and resumed each time, against one that was left alone.
+
+    python benchmarks/kills.py FLIGHT --out outputs/kills [--kills 20] [--dense stereo]
+
+The first map runs through and tells how long it takes. The second one is killed (SIGKILL, with its children) after
+random times that are drawn so that the moments lie all over the map's steps, started again each time, and at last left
+to end. Then every product must be the same to the last bit but report and map.json, which tell times. Exit code 1 if not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+SAME = ("cloud.laz", "dsm.tif", "orthophoto.tif", "transforms.json")
+START_S = 2.0
+"""About what a process takes before it does anything that could be lost."""
+
+
+def fingerprints(folder: Path) -> dict[str, str]:
+    """SHA-256 of every product that tells no times."""
+    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in SAME}
+
+
+def start(command: list[str], log: Path) -> subprocess.Popen:
+    """The map in a process group of its own."""
+    with log.open("a") as out:
+        return subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True)
+
+
+def last_step(log: Path) -> str:
+    """The last step that a map told of."""
+    lines = log.read_text(errors="replace").replace("\r", "\n").strip().splitlines()
+    return next((line.split()[0] for line in reversed(lines) if line.split()), "start")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("flight", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("outputs/kills"))
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--dense", choices=("stereo", "sweep"), default="stereo")
+    parser.add_argument("--size", type=int, default=1600)
+    asked = parser.parse_args()
+    shutil.rmtree(asked.out, ignore_errors=True)
+    asked.out.mkdir(parents=True)
+
+    def command(folder: str) -> list[str]:
+        own = [sys.executable, "-m", "overfly.cli", "map", str(asked.flight), "--out", str(asked.out / folder)]
+        return [*own, "--dense", asked.dense, "--size", str(asked.size)]
+
+    begun = time.perf_counter()
+    if start(command("whole"), asked.out / "whole.log").wait():
+        raise SystemExit((asked.out / "whole.log").read_text())
+    whole = time.perf_counter() - begun
+    rng, log = np.random.default_rng(asked.seed), asked.out / "killed.log"
+    killed: list[str] = []
+    while len(killed) < asked.kills:
+        child = start(command("killed"), log)
+        # Twice the mean share of what is to be done, so that the kills are spread from the first step to the last.
+        wait = START_S + rng.uniform(0, 2 * whole / asked.kills)
+        try:
+            code = child.wait(timeout=wait)
+        except subprocess.TimeoutExpired:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+            killed.append(last_step(log))
+            print(f"killed after {wait:.1f} s, at: {killed[-1]}", flush=True)
+            continue
+        if code:
+            raise SystemExit(log.read_text())
+        shutil.rmtree(asked.out / "killed")  # it came to its end before all kills: the rest hits a new one
+    if start(command("killed"), log).wait():
+        raise SystemExit(log.read_text())
+    first, second = (fingerprints(asked.out / folder) for folder in ("whole", "killed"))
+    differing = [name for name in SAME if first[name] != second[name]]
+    print(f"{asked.kills} kills; {'the same to the last bit' if not differing else f'different: {differing}'}")
+    raise SystemExit(bool(differing))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""What the heights of a map refer to: the ellipsoid, a vertical CRS, or ground control."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from overfly.errors import InputError
+from overfly.geodesy import crs_from_enu, vertical_crs
+from overfly.mapping.block import Block
+
+
+def with_heights(block: Block, asked: str | None) -> Block:
+    """The block, its products in the vertical CRS asked for; unchanged where none is asked for.
+
+    Args:
+        block: with cameras in metres on the Earth, if heights are asked for.
+        asked: see :func:`overfly.geodesy.vertical_crs`.
+
+    Raises:
+        InputError: the place on the Earth, or what the controls' heights refer to, is not known; no grid covers it.
+    """
+    if asked is None:
+        return block
+    if block.origin is None or not block.metric:
+        raise InputError(
+            f"--heights {asked} needs a place on the Earth, which this flight does not tell: give GPS in the images or "
+            "a geo.txt, or leave it out."
+        )
+    if _held_by_controls(block) and block.origin.vertical_epsg is None:
+        raise InputError(
+            f"--heights {asked} cannot be reached from the heights of gcp_list.txt, which do not say what they refer "
+            f"to: write EPSG:{block.origin.crs_epsg}+5773, or the right vertical CRS, into its first line."
+        )
+    origin = replace(block.origin, vertical_epsg=vertical_crs(asked))
+    crs_from_enu(np.zeros((1, 3)), origin)  # refuses a grid that does not reach here, before the long steps
+    return replace(block, origin=origin)
+
+
+def heights_of(block: Block) -> str | None:
+    """What the products' heights refer to: ``EPSG:5773``, ``ellipsoid``, ``controls`` (as they have them); or None.
+
+    Heights of GPS are taken as over the ellipsoid, which not every receiver writes.
+    """
+    if block.origin is None or not block.metric:
+        return None
+    if block.origin.vertical_epsg is not None:
+        return f"EPSG:{block.origin.vertical_epsg}"
+    return "controls" if _held_by_controls(block) else "ellipsoid"
+
+
+def _held_by_controls(block: Block) -> bool:
+    return block.survey is not None and block.survey.sigma_m is not None
