@@ -4,7 +4,8 @@
 
 The first map runs through and tells how long it takes. The second one is killed (SIGKILL, with its children) after
 random times that are drawn so that the moments lie all over the map's steps, started again each time, and at last left
-to end. Then every product must be the same to the last bit but report and map.json, which tell times. Exit code 1 if not.
+to end. Then every product must be the same to the last bit but report and map.json, which tell times; exit code 1 if
+not.
 """
 
 from __future__ import annotations
