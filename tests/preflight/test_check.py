@@ -151,7 +151,7 @@ def test_a_told_altitude_at_odds_with_the_pictures_is_said(flight, looks):
     wrong = replace(flight, frames=[replace(f, relative_altitude=ALTITUDE + 60) for f in flight.frames])
     (finding,) = about(position_findings(wrong, place(wrong, looks, None)), "altitude")
     assert "108 m" in str(finding)
-    assert "49 m below" in str(finding)
+    assert "48 m below" in str(finding)
 
 
 def moved(frame, east=0.0, up=0.0):
@@ -274,6 +274,16 @@ def test_images_of_which_none_can_be_decoded_give_no_map(tmp_path):
     for path in root.glob("*.jpg"):
         path.write_bytes(path.read_bytes().replace(b"\xff\xdb", b"\xff\xee"))  # no quantisation tables
     assert not check_flight(root).mappable
+
+
+@pytest.mark.parametrize(("blank", "level"), [(range(2, 24, 5), "bad"), (range(7, 9), "warn")])
+def test_images_without_any_texture_are_told_apart_from_those_with_some(flight, looks, blank, level):
+    """Half of a picture without texture is a hole; an image without any is lost, and many of them are the worst."""
+    lost = [replace(one, flat=0.97) if i in blank else replace(one, flat=0.6 * (i < 2)) for i, one in enumerate(looks)]
+    first, second = about(image_findings(flight, lost, None), "texture")
+    assert (first.level, second.level) == (level, "warn")
+    assert first.images == tuple(flight.frames[i].name for i in blank)
+    assert second.images == tuple(f.name for f in flight.frames[:2])
 
 
 def test_copies_of_one_image_and_water_give_no_map(tmp_path):

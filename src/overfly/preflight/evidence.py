@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -75,8 +75,9 @@ class Evidence:
     def contradict(self, i: int, j: int) -> bool:
         """Whether the pictures clearly tell another displacement than the positions."""
         off = self.difference(i, j)
-        least = max(TIMES_CONTRADICT * OFF_TRACK, CONTRADICT * self._apart(i, j))
-        return off is not None and float(np.linalg.norm(off)) > least
+        if off is None:
+            return False
+        return float(np.linalg.norm(off)) > max(TIMES_CONTRADICT * OFF_TRACK, CONTRADICT * self._apart(i, j))
 
     def _apart(self, i: int, j: int) -> float:
         """The longer of both displacements, so that a wrong position does not shrink what is allowed."""
@@ -84,19 +85,24 @@ class Evidence:
         by_pictures = 0.0 if seen is None or self.scale is None else self.scale * float(np.linalg.norm(seen))
         return max(float(np.linalg.norm(self.xy[j] - self.xy[i])), by_pictures)
 
-    def excused(self, suspects: Sequence[tuple[int, float]]) -> set[int]:
-        """Which suspects (image, metres off) the pictures join to an image that is beyond suspicion."""
-        off = dict(suspects)
+    def excused(self, suspects: Sequence[tuple[int, float]], wrong: Collection[int] = ()) -> set[int]:
+        """Which suspects (image, metres off) the pictures join to an image that is beyond suspicion.
+
+        Args:
+            suspects: whose positions the track does not explain.
+            wrong: further images that give no excuse.
+        """
+        off = {k: away for k, away in suspects if k not in wrong}
         excused: set[int] = set()
         waiting = True
         while waiting:
             waiting = False
             for k in off.keys() - excused:
-                beside = [j for j in (k - 2, k - 1, k + 1, k + 2) if j not in off or j in excused]
+                beside = [j for j in (k - 2, k - 1, k + 1, k + 2) if j not in wrong and (j not in off or j in excused)]
                 pairs = [(min(j, k), max(j, k)) for j in beside]
                 # A picture that agrees no better than the track does excuses nothing.
                 good = [pair for pair in pairs if self.agree(*pair) and self._miss(*pair) < off[k] / 2]
-                if good and not any(self.contradict(*pair) for pair in pairs if abs(pair[0] - pair[1]) == 1):
+                if good and not any(self.contradict(*pair) for pair in pairs if pair[1] - pair[0] == 1):
                     excused.add(k)
                     waiting = True
         return excused
@@ -125,12 +131,15 @@ class Evidence:
         return sorted(found.items(), key=lambda entry: -entry[1])[:most]
 
     def _off(self, run: range) -> float | None:
-        """How far a run of images is off by all pairs across its ends, metres; None where these do not tell alike."""
+        """How far a run of images is off by all pairs across its ends, metres; None where these do not tell alike.
+
+        Within the run the pictures must agree with the positions.
+        """
         before, after = run[0] - 1, run[-1] + 1
         pairs = {(before, run[0]): 1, (before - 1, run[0]): 1, (run[-1], after): -1, (run[-1], after + 1): -1}
         if len(run) > 1:
             pairs |= {(before, run[1]): 1, (run[-2], after): -1}
-        if any(self.agree(*pair) for pair in pairs):
+        if any(self.agree(*pair) for pair in pairs) or not all(self.agree(i, j) for i, j in pairwise(run)):
             return None
         offs = [sign * off for pair, sign in pairs.items()
                 if self.contradict(*pair) and (off := self.difference(*pair)) is not None]  # fmt: skip

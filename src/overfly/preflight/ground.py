@@ -78,12 +78,15 @@ def shifts_of(looks: Sequence[Look]) -> Shifts:
     import cv2
 
     found = np.full((max(len(looks) - 1, 0), 2), np.nan)
-    for i, (a, b) in enumerate(pairwise(looks)):
-        if a.thumbnail is None or b.thumbnail is None or a.thumbnail.shape != b.thumbnail.shape:
+    # OpenCV applies the window to its arguments where they need no padding: what others look at must not be given. A
+    # picture is so windowed once as the second and once more as the first of a pair; CLEAR_PEAK was found with that.
+    own = [None if look.thumbnail is None else look.thumbnail.copy() for look in looks]
+    for i, (a, b) in enumerate(pairwise(own)):
+        if a is None or b is None or a.shape != b.shape:
             continue
-        window = cv2.createHanningWindow(a.thumbnail.shape[::-1], cv2.CV_32F)
-        shift, peak = cv2.phaseCorrelate(a.thumbnail, b.thumbnail, window)
-        if peak >= CLEAR_PEAK and a.digest != b.digest:
+        window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F)
+        shift, peak = cv2.phaseCorrelate(a, b, window)
+        if peak >= CLEAR_PEAK and looks[i].digest != looks[i + 1].digest:
             found[i] = np.array(shift) / THUMBNAIL
     return Shifts(found)
 

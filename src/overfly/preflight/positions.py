@@ -112,8 +112,8 @@ def _off_track(frames: Sequence[Frame], xy: Array, evidence: Evidence | None) ->
     found = strays(xy, _seconds(frames)) if len(frames) >= 6 else []
     accused: dict[int, float] = {}
     if evidence is not None:
-        excused = evidence.excused(found)
         accused = dict(evidence.accused())
+        excused = evidence.excused(found, accused)
         found = [(i, off) for i, off in found if i not in excused and i not in accused]
     if not found and not accused:
         return

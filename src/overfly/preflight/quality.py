@@ -137,7 +137,7 @@ def _texture(looks: Sequence[Look], those: Those) -> Iterator[Finding]:
             "bad" if len(nothing) > MANY * len(looks) else "warn",
             "texture",
             f"{count(len(nothing), 'image')} of {len(looks)} without any texture ({some(nothing)})",
-            "they will not be placed and leave holes; look at them: water, snow, fog or a covered lens cannot be matched",
+            "they will not be placed and leave holes; look at them: nothing matches water, snow, fog or a covered lens",
             nothing,
         )
     if found:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -149,16 +150,15 @@ def _onwards(
     return away
 
 
-def _by_neighbours(xy: Array, seconds: Array | None) -> Array:
-    by_order = off_track(xy)
-    return by_order if seconds is None else np.minimum(by_order, off_track(xy, seconds))
+def _by_neighbours(xy: Array, clocks: Sequence[Array]) -> Array:
+    return np.asarray(np.minimum.reduce([off_track(xy, clock) for clock in clocks]))
 
 
-def _away(xy: Array, seconds: Array | None) -> Array:
-    """Off the track as its neighbours in order, in time or by the layout tell: the least counts, metres [n]."""
-    away = _by_neighbours(xy, seconds)
+def _away(xy: Array, clocks: Sequence[Array]) -> Array:
+    """Off the track as its neighbours, by each clock, or the layout tell: the least counts, metres [n]."""
+    away = _by_neighbours(xy, clocks)
     if len(xy) < 4:
-        return np.asarray(away)
+        return away
     if layouts := layouts_of(xy):
         # Each position belongs to the lines that are flown around it.
         near = np.array([np.convolve(one.lines, np.ones(NEAR), "full")[NEAR // 2 - 1 :][: len(xy)] for one in layouts])
@@ -183,12 +183,15 @@ def strays(xy: Array, seconds: Array | None) -> list[tuple[int, float]]:
         seconds: when each was taken [n], increasing; None where unknown.
     """
 
+    # The number of an image is a clock too: what is left out leaves a gap.
+    clocks = [np.arange(len(xy), dtype=float), *([] if seconds is None else [seconds])]
+
     def away(kept: NDArray[np.int64]) -> Array:
-        return _away(xy[kept], None if seconds is None else seconds[kept])
+        return _away(xy[kept], [clock[kept] for clock in clocks])
 
     kept = np.arange(len(xy))
     # What is usual is told without the layout's answers: a track that turns all the time has no outliers.
-    limit = max(OFF_TRACK, TIMES_USUAL * float(np.median(_by_neighbours(xy, seconds))))
+    limit = max(OFF_TRACK, TIMES_USUAL * float(np.median(_by_neighbours(xy, clocks))))
     found: list[tuple[int, float]] = []
     while len(kept) >= 6 and len(found) < len(xy) // 4:
         now = away(kept)
