@@ -7,7 +7,7 @@ import pytest
 
 from overfly.cloud import Cloud
 from overfly.errors import InputError
-from overfly.mapping.rough_mesh import FILL, rough_mesh
+from overfly.mapping.rough_mesh import FILL, cell_of, rough_mesh, without_spikes
 from overfly.mesh import Mesh
 from overfly.rendering import topology
 
@@ -115,3 +115,27 @@ def test_a_few_neighbours_in_a_sparse_cloud_do_not_make_cells_without_number() -
     dense = np.c_[rng.uniform(50, 53, (400, 2)), np.zeros(400)]
     mesh = rough_mesh(Cloud(np.concatenate([sparse, dense])), faces=2000)
     assert 0 < len(mesh.faces) <= 2200
+
+
+def test_spikes_go_and_edges_of_roofs_stay() -> None:
+    rough = rough_mesh(box_on_plane(), faces=3000)
+    assert cell_of(rough) == pytest.approx(60 / np.sqrt(1500), rel=0.05)
+    mesh = without_spikes(rough)
+    changed = mesh.vertices != rough.vertices
+    assert changed.sum() <= 2  # half way up a wall
+    assert np.isin(mesh.vertices[changed], [0, ROOF]).all()
+    x, y, _ = mesh.vertices.T
+    ground = np.flatnonzero((np.abs(x) < 25) & (np.abs(y) < 25) & ((np.abs(x) > 14) | (np.abs(y) > 14)))
+    alone = ground[::37]  # no two of them side by side, but for the pair
+    pair = mesh.faces[(mesh.faces == alone[0]).any(1)][0][:2]
+    raised = np.concatenate([alone, pair])
+    vertices, colors = mesh.vertices.copy(), mesh.colors
+    assert colors is not None
+    vertices[raised, 2] = np.where(np.arange(len(raised)) % 2, 12.0, -12.0)
+    vertices[pair, 2] = 15.0
+    colors = colors.copy()
+    colors[raised] = 255
+    clean = without_spikes(Mesh(vertices, mesh.faces, colors))
+    np.testing.assert_allclose(clean.vertices, mesh.vertices, atol=1e-9)
+    assert clean.colors is not None
+    assert np.abs(clean.colors[raised].astype(int) - [20, 180, 40]).max() <= 1

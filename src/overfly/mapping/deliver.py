@@ -29,7 +29,7 @@ from overfly.mapping.orthophoto import Orthophoto
 from overfly.mapping.products import SAMPLE, WINDOW, raster_products
 from overfly.mapping.raster import Grid, Surface
 from overfly.mapping.report import Caution, count_text, duration, write_report
-from overfly.mapping.rough_mesh import rough_mesh
+from overfly.mapping.rough_mesh import rough_mesh, without_spikes
 from overfly.mapping.settings import MESH_FACES, MapSettings
 from overfly.mapping.steps import Steps, peak_memory_mb
 from overfly.mapping.tiles import Tiles
@@ -147,13 +147,14 @@ def _mesh(
 
     faces, found = min(asked.mesh_faces or MESH_FACES, len(few)), list[Caution]()
     if asked.mesh_faces is not None and asked.mesh_faces > faces:
-        what = f"--mesh-faces {asked.mesh_faces} asks for more triangles than the {faces} points that the mesh is of."
-        found.append(Caution(what, "It has one a point; match at a larger --size, or allow more --max-memory."))
+        what = f"--mesh-faces {asked.mesh_faces} asks for more triangles than the {faces} points that make the mesh."
+        advice = "It has one for each; for more, match at a larger --size or allow more --max-memory."
+        found.append(Caution(what, advice))
     placed = georeferenced(few[:0], block)
     try:
         made = write_textured_mesh(
             path,
-            rough_mesh(few, faces=faces),
+            without_spikes(rough_mesh(few, faces=faces)),
             views,
             gains,
             place=lambda points: georeferenced(Cloud(points), block).points,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from overfly.flights.footprint import border_pixels
 from overfly.geometry import Array, Camera, invert, project, rays, transform
+from overfly.mapping.rough_mesh import cell_of
 from overfly.mapping.visibility import View
 from overfly.mesh import Mesh
 from overfly.rendering.operations import interpolate, rasterise
@@ -91,7 +92,7 @@ def rank_views(
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
     smooth, middle = _smoothed(mesh, across), corners.mean(1)
-    cell = float(np.sqrt(np.median(np.abs(across[:, 2]))))  # side of the square that two faces make
+    cell = cell_of(mesh)
     found = Candidates(np.full((len(faces), CANDIDATES), -1, np.int32), np.zeros((len(faces), CANDIDATES), np.float32))
     for i, view in enumerate(views):
         camera, pose = view.camera, view.world_from_camera

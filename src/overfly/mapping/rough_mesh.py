@@ -22,6 +22,9 @@ PARTS = 4
 TRIM = 0.001
 """Share of the points left out on each side of the grid: single stray points."""
 
+SPIKE = 3.0
+"""Cells by which a vertex of a spike differs in height from its neighbours."""
+
 NO_GROUND = "The cloud covers no connected ground: a mesh needs points that lie beside each other."
 
 
@@ -101,3 +104,34 @@ def _medians(cloud: Cloud, grid: Grid) -> tuple[NDArray[np.float64], NDArray[np.
     middle = order[cell, np.maximum(known - 1, 0) // 2]
     colors = None if seen.colors is None else parts(seen.colors)[cell, middle]
     return np.where(known > 0, heights[cell, middle], np.nan).reshape(grid.rows, grid.columns), colors
+
+
+def without_spikes(mesh: Mesh) -> Mesh:
+    """A height field without single vertices and pairs that stand apart from all others: stray points, bare stems.
+
+    A vertex with three neighbours or more of which fewer than two join it within :data:`SPIKE` cells in height takes
+    the median height, and the colour, of those that are no spikes.
+    """
+    z = mesh.vertices[:, 2]
+    ends = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]).astype(np.int64)
+    # Sides inside the mesh appear once each way, those of its outline once.
+    keys = np.unique(np.concatenate([ends, ends[:, ::-1]]) @ [len(z), 1])
+    ends = np.column_stack(np.divmod(keys, len(z)))
+    near, count = np.abs(z[ends[:, 0]] - z[ends[:, 1]]) <= SPIKE * cell_of(mesh), np.bincount(ends[:, 0])
+    spike = (count >= 3) & (np.bincount(ends[:, 0], near) < 2)
+    ends = ends[spike[ends[:, 0]] & ~spike[ends[:, 1]]]
+    order = np.lexsort((z[ends[:, 1]], ends[:, 0]))
+    spikes, first, beside = np.unique(ends[order, 0], return_index=True, return_counts=True)
+    middle = ends[order, 1][first + beside // 2]
+    vertices, colors = mesh.vertices.copy(), None if mesh.colors is None else mesh.colors.copy()
+    vertices[spikes, 2] = z[middle]
+    if colors is not None:
+        colors[spikes] = colors[middle]
+    return Mesh(vertices, mesh.faces, colors)
+
+
+def cell_of(mesh: Mesh) -> float:
+    """Side of the squares of which two faces each make one."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i], :2] for i in range(3))
+    (u, v), (x, y) = (b - a).T, (c - a).T
+    return float(np.sqrt(np.median(np.abs(u * y - v * x))))

@@ -28,8 +28,9 @@ from overfly.rendering.topology import topology
 
 Bar = Callable[[str, str], AbstractContextManager[Callable[[int, int], None]]]
 
-TEXELS = 4
-"""Pixels along a cell of the mesh where the cloud gives the colours: JPEG blends the colours of single ones."""
+TEXELS, WIDEST = 4, 4096
+"""Pixels along a cell of the mesh where the cloud gives the colours, for JPEG blends the colours of single ones; fewer
+where that picture would be wider."""
 
 
 def write_textured_mesh(
@@ -131,14 +132,15 @@ class Above:
         assert mesh.colors is not None
         columns, column = np.unique(mesh.vertices[:, 0], return_inverse=True)
         rows, row = np.unique(-mesh.vertices[:, 1], return_inverse=True)
-        self.pixels = TEXELS * (np.column_stack([column, row]) + 0.5)
+        self._texels = min(TEXELS, max(1, WIDEST // max(len(rows), len(columns))))
+        self.pixels = self._texels * (np.column_stack([column, row]) + 0.5)
         self._colors = np.zeros((len(rows), len(columns), 3), np.uint8)
         self._colors[row, column] = mesh.colors
 
     @property
     def size(self) -> tuple[int, int]:
         rows, columns, _ = self._colors.shape
-        return TEXELS * columns, TEXELS * rows
+        return self._texels * columns, self._texels * rows
 
     def read(self, size: tuple[int, int]) -> Image:
         import cv2
