@@ -5,7 +5,9 @@
 Rendered flights with GPS noise, some of them spoilt (little overlap, missing frames, blur, faded or black pictures) are
 checked, then their cameras are estimated. AUC: of expected shares of placed images against flights of which at least
 95 % were placed. Then eight faults are injected into good flights, each by itself: a check is right if the worst
-finding that the untouched flight does not have names the cause. Photographs and placements are kept.
+finding that the untouched flight does not have names the cause. Last, flights of every path without any fault are
+checked, whole and without every second image, and with one position 44 m off in any direction: GPS must be blamed in
+the last case alone, and the right image. Photographs and placements are kept.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import argparse
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +26,16 @@ from scipy.stats import mannwhitneyu
 
 from overfly.errors import InputError
 from overfly.files import replacing
-from overfly.flights import fly, read_flight
+from overfly.flights import PATHS, Flight, Gps, fly, read_flight
 from overfly.mapping.map import align_flight
 from overfly.preflight.check import check_flight
+from overfly.preflight.ground import place
+from overfly.preflight.images import Look, look_at_all
+from overfly.preflight.positions import position_findings
 from overfly.tables import markdown
 
 STYLES = ("campus", "blocks", "suburb", "industrial", "village", "vegetation")
+OVERLAPS = (30, 50, 65, 80)
 PLACED = 0.95
 Change = Callable[[Image.Image], Image.Image]
 
@@ -61,6 +68,11 @@ def flight_of(out: Path, style: str, seed: int, path: str, overlap: float, frame
     """The photographs of a rendered flight, without the cameras beside them."""
     fly(style, out=out / "full", flight_path=path, overlap=overlap, side_overlap=max(overlap, 15), altitude=120,
         width=480, height=360, frames=frames, seed=seed, noise="gps", reference_points=0)  # fmt: skip
+    return fresh(out)
+
+
+def fresh(out: Path) -> list[Path]:
+    """The photographs of a rendered flight as they were taken."""
     shutil.rmtree(out / "photos", ignore_errors=True)
     shutil.copytree(out / "full" / "images", out / "photos")
     return sorted((out / "photos").iterdir())
@@ -147,7 +159,7 @@ def named(out: Path, number: int) -> dict[str, bool]:
     flight_of(folder, style, 3000 + number, "grid", 65, frames=20)
     usual = {(finding.topic, finding.level) for finding in check_flight(folder / "photos").findings}
     for fault in FAULTS:
-        inject(fault, flight_of(folder, style, 3000 + number, "grid", 65, frames=20))
+        inject(fault, fresh(folder))
         findings = check_flight(folder / "photos").findings
         new = [finding for finding in findings if (finding.topic, finding.level) not in usual]
         # Missing images are gaps as well as too little overlap.
@@ -157,16 +169,48 @@ def named(out: Path, number: int) -> dict[str, bool]:
     return result
 
 
+def blamed(flight: Flight, looks: list[Look]) -> set[str]:
+    """Names of the images whose positions are called wrong."""
+    findings = position_findings(flight, place(flight, looks, None), looks)
+    return {name for finding in findings if finding.topic == "gps" for name in finding.images}
+
+
+def alarms(out: Path, number: int) -> dict[str, Any]:
+    """Blame for GPS in a flight without a fault, in its every second image, and with one position 44 m off."""
+    rng = np.random.default_rng([8, number])
+    path, overlap = PATHS[number % len(PATHS)], float(OVERLAPS[number // len(PATHS) % len(OVERLAPS)])
+    style, folder = str(rng.choice(STYLES)), out / f"healthy-{number:03d}"
+    flight_of(folder, style, 4000 + number, path, overlap, frames=int(rng.integers(14, 34)))
+    flight = read_flight(folder / "photos")
+    looks, frames = look_at_all([frame.path for frame in flight.frames]), flight.frames
+    row: dict[str, Any] = {"style": style, "path": path, "overlap": overlap, "images": len(frames)}
+    row |= {"false": bool(blamed(flight, looks)), "false_halved": False, "errors": 0, "named": 0, "others": 0}
+    if len(frames) >= 12:
+        row["false_halved"] = bool(blamed(replace(flight, frames=frames[::2]), looks[::2]))
+    for i in sorted({0, 1, len(frames) // 3, len(frames) // 2, len(frames) - 1}) if len(frames) >= 8 else ():
+        gps, angle = frames[i].gps, rng.uniform(0, 2 * np.pi)
+        assert gps is not None
+        north, east = 4e-4 * np.cos(angle), 4e-4 * np.sin(angle) / np.cos(np.radians(gps.latitude))  # 44 m
+        wrong = replace(frames[i], gps=Gps(gps.latitude + north, gps.longitude + east, gps.altitude))
+        told = blamed(replace(flight, frames=[*frames[:i], wrong, *frames[i + 1 :]]), looks)
+        row["errors"] += 1
+        row["named"] += frames[i].name in told
+        row["others"] += bool(told - {frames[i].name})
+    return row
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/registration"))
     parser.add_argument("--flights", type=int, default=60)
     parser.add_argument("--first", type=int, default=0, help="number of the first flight: other flights, another test")
     parser.add_argument("--faulty", type=int, default=6, help="good flights into which the faults are injected")
+    parser.add_argument("--healthy", type=int, default=16, help="flights without a fault, in which none may be told")
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     rows = [outcome(asked.out, number) for number in range(asked.first, asked.first + asked.flights)]
     right = [named(asked.out, number) for number in range(asked.faulty)]
+    quiet = [alarms(asked.out, number) for number in range(asked.healthy)]
     print(markdown(rows))
     if rows:
         good = np.array([row["placed"] >= PLACED for row in rows])

@@ -19,8 +19,8 @@ TIMES_USUAL = 6.0
 ALONG_DEG, ACROSS_DEG = 20.0, 30.0
 """Steps nearer to the direction of the lines than the first go along a line, further off than the second turn."""
 
-LEAST_ALONG = 0.4
-"""Share of steps along one direction from which a flight consists of lines."""
+LEAST_ALONG, LEAST_BOTH = 0.4, 0.6
+"""Share of steps along one direction, and along two that cross, from which a flight consists of lines."""
 
 LEAST_SECOND = 0.2
 """Share of steps on lines across the others from which they are lines of their own."""
@@ -77,7 +77,7 @@ class Layout:
 def layouts_of(xy: Array) -> list[Layout]:
     """The lines of positions [n, 2], one layout for each direction flown.
 
-    Empty where less than :data:`LEAST_ALONG` of the steps share a direction; a second one is of lines across these.
+    Empty where less than :data:`LEAST_ALONG` of the steps share a direction, or :data:`LEAST_BOTH` two that cross.
     """
     steps = np.diff(xy, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -86,13 +86,12 @@ def layouts_of(xy: Array) -> list[Layout]:
     bearing = np.where(lengths > 0, np.arctan2(steps[:, 0], steps[:, 1]), np.nan)
     alike = np.abs((bearing[:, None] - bearing + np.pi / 2) % np.pi - np.pi / 2) < np.radians(ALONG_DEG)
     best = alike[int(alike.sum(1).argmax())]
-    if best.sum() < LEAST_ALONG * len(steps):
-        return []
     found = [_layout(xy, steps, lengths, best)]
     across = np.abs((bearing - np.arctan2(*found[0].ahead) + np.pi) % np.pi - np.pi / 2) < np.radians(ALONG_DEG)
     if (across[1:] & across[:-1]).sum() >= max(2, LEAST_SECOND * len(steps)):  # turns follow one by one on lines
         found.append(_layout(xy, steps, lengths, across))
-    return found
+    least = LEAST_ALONG if len(found) == 1 else LEAST_BOTH
+    return found if np.mean([one.lines for one in found]) * len(found) >= least else []
 
 
 def _layout(xy: Array, steps: Array, lengths: Array, along_line: NDArray[np.bool_]) -> Layout:
