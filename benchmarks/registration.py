@@ -221,6 +221,10 @@ def main() -> None:
     if right:
         shares = {topic: f"{sum(r[topic] for r in right)} of {len(right)}" for topic in right[0]}
         print(f"Named causes: {shares}; {np.mean([list(r.values()) for r in right]):.0%} right")
+    if quiet:
+        print(markdown(quiet))
+        total = {key: sum(row[key] for row in quiet) for key in ("false", "false_halved", "errors", "named", "others")}
+        print(f"\nGPS blamed in {len(quiet)} flights without a fault: {total}")
 
 
 if __name__ == "__main__":
