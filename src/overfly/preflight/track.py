@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,35 @@ class Layout:
     lines: NDArray[np.bool_]
     turns: NDArray[np.bool_]
 
+    @property
+    def moved(self) -> Array:
+        """How far each step goes along and across the lines, without sign [n - 1, 2]."""
+        return np.abs(np.diff(self.places, axis=0))
+
+    @property
+    def back(self) -> NDArray[np.bool_]:
+        """Positions [n] to another line and straight back again: errors, not turns."""
+        found = np.zeros(len(self.places), bool)
+        across = self.moved[:, 1]
+        found[1:-1] = np.abs(self.places[2:, 1] - self.places[:-2, 1]) < np.minimum(across[1:], across[:-1]) / 2
+        found[1:-1] &= self.turns[1:] & self.turns[:-1]
+        return found
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Turns that others may follow as a precedent [n - 1]."""
+        return np.asarray(self.turns & ~self.back[1:] & ~self.back[:-1])
+
+    @property
+    def beside(self) -> NDArray[np.bool_]:
+        """Steps before or after one along a line [n - 1]."""
+        padded = np.pad(self.lines, 1)
+        return np.asarray(padded[:-2] | padded[2:])
+
+    def reversed(self) -> Layout:
+        """The same flown from its end to its start."""
+        return replace(self, places=self.places[::-1], lines=self.lines[::-1], turns=self.turns[::-1])
+
 
 def layouts_of(xy: Array) -> list[Layout]:
     """The lines of positions [n, 2], one layout for each direction flown.
@@ -104,42 +133,51 @@ def _layout(xy: Array, steps: Array, lengths: Array, along_line: NDArray[np.bool
     return Layout(xy @ axes.T, axes[0], float(np.median(lengths[along_line])), along_line, turns)
 
 
-def by_layout(layout: Layout) -> Array:
+def by_layouts(layouts: Sequence[Layout]) -> Array:
     """How far each of n positions is from where the layout lets its neighbours go, metres [n]; inf without an answer.
 
     Lines of one or two images, which pictures left out or the border of the ground make, have no track of their own. A
     position may lie beside its neighbour as far as other lines of the flight do, and may continue such a short line.
+
+    Args:
+        layouts: of the same positions, at least one; each position belongs to the lines that are flown around it.
     """
-    places, turns = layout.places, layout.turns
-    # To another line and straight back again is an error, no turn: such steps are no precedents either.
-    back = np.zeros(len(places), bool)
-    across = np.abs(np.diff(places[:, 1]))
-    back[1:-1] = np.abs(places[2:, 1] - places[:-2, 1]) < np.minimum(across[1:], across[:-1]) / 2
-    back[1:-1] &= turns[1:] & turns[:-1]
-    known = turns & ~back[1:] & ~back[:-1]
-    forward = _onwards(places, turns, known, back, layout.step)
-    backward = _onwards(places[::-1], turns[::-1], known[::-1], back[::-1], layout.step)
-    return np.minimum(forward, backward[::-1])
+    count = len(layouts[0].places)
+    near = np.array([np.convolve(one.lines, np.ones(NEAR), "full")[NEAR // 2 - 1 :][:count] for one in layouts])
+    found = np.full((len(layouts), count), np.inf)
+    for row, one in zip(found, layouts, strict=True):
+        elsewhere = [
+            np.zeros((0, 2)),
+            *(other.moved[other.known & other.beside] for other in layouts if other is not one),
+        ]
+        forward = _onwards(one, np.concatenate(elsewhere))
+        backward = _onwards(one.reversed(), np.concatenate(elsewhere))
+        row[:] = np.minimum(forward, backward[::-1])
+    return np.asarray(np.where(near == near.max(0), found, np.inf).min(0))
 
 
-def _onwards(
-    places: Array, turns: NDArray[np.bool_], known: NDArray[np.bool_], back: NDArray[np.bool_], step: float
-) -> Array:
-    """Off what a turn from the position before, or the first step after such a turn, leads to, metres [n]."""
-    away, turned = np.full((2, len(places)), np.inf)
-    moved = np.abs(np.diff(places, axis=0))
-    for i in range(1, len(places)):
+def _onwards(layout: Layout, elsewhere: Array) -> Array:
+    """Off what a turn from the position before, or the first step after such a turn, leads to, metres [n].
+
+    Args:
+        layout: of n positions.
+        elsewhere: turns along and across other lines [k, 2].
+    """
+    turns, moved, step, known, back = layout.turns, layout.moved, layout.step, layout.known, layout.back
+    away, turned = np.full((2, len(layout.places)), np.inf)
+    for i in range(1, len(away)):
         along, across = moved[i - 1]
-        others = known.copy()
-        others[max(0, i - 1) : i + 1] = False  # no step is its own precedent
-        if turns[i - 1] and not back[i] and others.any():
+        own = known.copy()
+        own[max(0, i - 1) : i + 1] = False  # no step is its own precedent
+        others = np.concatenate([moved[own], elsewhere])
+        if turns[i - 1] and not back[i] and len(others):
             # A turn like it, or from the end of a line to any place of the next.
-            turned[i] = np.linalg.norm(moved[others] - moved[i - 1], axis=1).min()
-            goes_on = i + 1 == len(places) or (not turns[i] and abs(moved[i, 0] - step) < step / 2)
+            turned[i] = np.linalg.norm(others - moved[i - 1], axis=1).min()
+            goes_on = i + 1 == len(away) or (not turns[i] and abs(moved[i, 0] - step) < step / 2)
             if goes_on and (i == 1 or not turns[i - 2]):
-                beside = float(np.abs(moved[others, 1] - across).min())
+                beside = float(np.abs(others[:, 1] - across).min())
                 turned[i] = min(turned[i], float(np.hypot(beside, max(0.0, along - step))))
-        if turns[i - 1] and i + 1 < len(places):
+        if turns[i - 1] and i + 1 < len(away):
             # Where no other line tells how far away the next may be, an image onwards and parallel does.
             turned[i] = min(turned[i], float(np.hypot(moved[i, 1], moved[i, 0] - step)))
         if not back[i]:
@@ -159,10 +197,7 @@ def _away(xy: Array, clocks: Sequence[Array]) -> Array:
     if len(xy) < 4:
         return away
     if layouts := layouts_of(xy):
-        # Each position belongs to the lines that are flown around it.
-        near = np.array([np.convolve(one.lines, np.ones(NEAR), "full")[NEAR // 2 - 1 :][: len(xy)] for one in layouts])
-        told = np.where(near == near.max(0), [by_layout(one) for one in layouts], np.inf)
-        return np.asarray(np.minimum(away, told.min(0)))
+        return np.minimum(away, by_layouts(layouts))
     # Without lines (orbits, free flights) every image may turn, but the ends have only one neighbour to tell it.
     for ends, row in ((slice(0, 2), 2), (slice(-2, None), 1)):
         others = np.delete(_answers(xy)[row], np.r_[np.arange(len(xy))[ends]])
