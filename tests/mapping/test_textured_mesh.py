@@ -194,6 +194,35 @@ def test_exposures_are_evened_by_the_gains(tmp_path: Path, mesh: Mesh) -> None:
     assert off[1] > 10
 
 
+def steps_at_seams(path: Path) -> np.ndarray:
+    """Differences [N] in colour between the charts that meet at a vertex, on the meadow far from the house."""
+    (part,) = trimesh.load_scene(path, process=False).geometry.values()
+    image = cv2.blur(np.asarray(part.visual.material.baseColorTexture.convert("RGB")), (5, 5))
+    uv = np.asarray(part.visual.uv)
+    column, row = (np.column_stack([uv[:, 0], 1 - uv[:, 1]]) * image.shape[1::-1]).astype(int).T
+    colors, vertices = image[row, column].astype(float), np.asarray(part.vertices)
+    order = np.lexsort(vertices.T)
+    i, j = order[:-1], order[1:]
+    meet = (vertices[i] == vertices[j]).all(1) & (np.abs(vertices[i][:, [0, 2]]) > house.HALF + 2 * CELL).any(1)
+    meet &= (np.abs(vertices[i][:, [0, 2]]) < 17).all(1)  # the cloud's colours begin at the edge of the photographs
+    return np.asarray(np.abs(colors[i] - colors[j]).mean(1)[meet])
+
+
+def test_light_that_falls_off_over_the_image_leaves_no_seams(tmp_path: Path, mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = house.frames(tmp_path)
+    x, y = np.meshgrid(np.linspace(-1, 1, house.CAMERA.width), np.linspace(-1, 1, house.CAMERA.height))
+    for frame in frames:
+        dark = cv2.imread(str(frame.path)) * (1 - 0.15 * x - 0.15 * y)[..., None]
+        cv2.imwrite(str(frame.path), np.rint(dark).astype(np.uint8))
+    written(tmp_path / "even.glb", mesh, frames)
+    monkeypatch.setattr("overfly.mapping.textured_mesh.movements", lambda colors, *_: np.zeros_like(colors))
+    written(tmp_path / "raw.glb", mesh, frames)
+    even, raw = steps_at_seams(tmp_path / "even.glb"), steps_at_seams(tmp_path / "raw.glb")
+    assert len(even) == len(raw) > 50
+    assert raw.mean() > 4
+    assert even.mean() < 0.5 * raw.mean()
+
+
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, textured: tuple[Path, dict], mesh: Mesh, frames) -> None:
     assert written(tmp_path / "again.glb", mesh, frames) == textured[1]
     assert (tmp_path / "again.glb").read_bytes() == textured[0].read_bytes()

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.geometry import Array
+from overfly.mapping.seams import cut_field
 from overfly.mapping.visibility import Image
 
 PAGE = 8192
@@ -152,6 +153,7 @@ def _shelves(size: NDArray[np.int64], side: int) -> tuple[NDArray[np.int64], NDA
 def paint(
     layout: Layout,
     pictures: Sequence[Picture],
+    movements: Callable[[int], NDArray[np.float32] | None],
     ground: NDArray,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[bytes]:
@@ -160,6 +162,7 @@ def paint(
     Args:
         layout: of the charts.
         pictures: that their boxes are cut from.
+        movements: of a picture's colours, see :func:`overfly.mapping.seams.field`; None where it has none.
         ground: [3] the colour between the boxes.
         progress: told (done, in all).
     """
@@ -172,12 +175,13 @@ def paint(
         canvas = np.empty((height, width, 3), np.uint8)
         canvas[:] = np.asarray(ground, np.uint8)[::-1]  # blue first: turning the page in the end would take it twice
         for i in [i for p, i in work if p == page]:
-            full = pictures[i].size
-            size = max(1, round(full[0] * layout.scale)), max(1, round(full[1] * layout.scale))
-            image = pictures[i].read(size)
+            image, moved = pictures[i].read(scaled(pictures[i].size, layout.scale)), movements(i)
             for c in np.flatnonzero((layout.page == page) & (boxes.picture == i)):
                 (x, y), (w, h) = layout.place[c], boxes.size[c]
-                canvas[y : y + h, x : x + w] = _cut(image, boxes.corner[c], boxes.size[c])[..., ::-1]
+                box = _cut(image, boxes.corner[c], boxes.size[c])
+                if moved is not None:
+                    box = np.rint(np.clip(box + cut_field(moved, boxes.corner[c], boxes.size[c], layout.scale), 0, 255))
+                canvas[y : y + h, x : x + w] = box[..., ::-1]
             done += 1
             if progress is not None:
                 progress(done, len(work))
@@ -185,6 +189,11 @@ def paint(
         assert good
         files.append(data.tobytes())
     return files
+
+
+def scaled(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Width and height of a picture when its boxes are cut."""
+    return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
 def _cut(image: Image, corner: NDArray, size: NDArray) -> Image:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,12 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.geometry import Array, project
-from overfly.mapping.atlas import Layout, Picture, lay_out, paint
+from overfly.mapping.atlas import Layout, Picture, lay_out, paint, scaled
 from overfly.mapping.face_labels import charts, choose
 from overfly.mapping.face_views import rank_views
 from overfly.mapping.gains import Gains
 from overfly.mapping.glb import Part, write_glb
+from overfly.mapping.seams import blurred, field, movements
 from overfly.mapping.visibility import Image, View
 from overfly.mesh import Mesh
 from overfly.rendering.topology import topology
@@ -79,8 +81,13 @@ def write_textured_mesh(
     pixels = _pixels(mesh, views, above, picture[corner_chart], vertex)
     low, high = _bounds(pixels, corner_chart, len(picture))
     layout = lay_out(picture, low, high)
+    owner = picture[corner_chart]
+    with bar("mesh", "tones") as update:
+        tones = _tones(pictures[:-1], owner, pixels, face, layout.scale, update)
+    moved = movements(tones, vertex, face)
     with bar("mesh", "texture") as update:
-        pages = paint(layout, pictures, mesh.colors.mean(0), update)
+        fields = partial(_field, pictures[:-1], owner, pixels, face, moved)
+        pages = paint(layout, pictures, fields, mesh.colors.mean(0), update)
     placed = place(mesh.vertices)
     origin = np.round((placed.min(0) + placed.max(0)) / 2)
     uv = layout.texture_coordinates(corner_chart, pixels)
@@ -166,6 +173,37 @@ def _pixels(mesh: Mesh, views: Sequence[View], above: Above, picture: NDArray, v
             assert pose is not None
             pixels[mine], _ = project(mesh.vertices[vertex[mine]], camera, pose)
     return np.asarray(pixels)
+
+
+def _tones(
+    photographs: Sequence[Picture],
+    owner: NDArray,
+    pixels: Array,
+    face: NDArray,
+    scale: float,
+    progress: Callable[[int, int], None],
+) -> Array:
+    """Colours of the charts' vertices [W, 3], averaged over a side of their faces; NaN where no photograph is."""
+    tones = np.full((len(pixels), 3), np.nan)
+    for i, photograph in enumerate(photographs):
+        mine = np.flatnonzero(owner == i)
+        if len(mine):
+            sides = pixels[face[owner[face[:, 0]] == i]]
+            width = float(np.median(np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1)))
+            size = scaled(photograph.size, scale)
+            tones[mine] = blurred(photograph.read(size), pixels[mine] * scale, width * scale)
+        progress(i + 1, len(photographs))
+    return tones
+
+
+def _field(
+    photographs: Sequence[Picture], owner: NDArray, pixels: Array, face: NDArray, moved: Array, i: int
+) -> NDArray[np.float32] | None:
+    """How the colours of picture ``i`` are moved; those of the cloud are not."""
+    if i >= len(photographs):
+        return None
+    used, faces = np.unique(face[owner[face[:, 0]] == i], return_inverse=True)
+    return field(photographs[i].size, pixels[used], moved[used], faces.reshape(-1, 3))
 
 
 def _bounds(pixels: Array, chart: NDArray, count: int) -> tuple[Array, Array]:
