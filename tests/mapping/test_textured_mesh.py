@@ -208,7 +208,9 @@ def steps_at_seams(path: Path) -> np.ndarray:
     return np.asarray(np.abs(colors[i] - colors[j]).mean(1)[meet])
 
 
-def test_light_that_falls_off_over_the_image_leaves_no_seams(tmp_path: Path, mesh: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_light_that_falls_off_over_the_image_leaves_no_seams(
+    tmp_path: Path, mesh: Mesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
     frames = house.frames(tmp_path)
     x, y = np.meshgrid(np.linspace(-1, 1, house.CAMERA.width), np.linspace(-1, 1, house.CAMERA.height))
     for frame in frames:
