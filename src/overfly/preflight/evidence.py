@@ -23,6 +23,9 @@ TIMES_CONTRADICT = 1.5
 LONGEST = 5
 """Images in a row that are off by the same, at most; a longer run may be the true one."""
 
+RELIABLE = 1 / 3
+"""Share of neighbours that must agree before pictures accuse: where fewer overlap, chance matches are as many."""
+
 Displacement = Callable[[int, int], Array | None]
 
 
@@ -118,6 +121,8 @@ class Evidence:
         is not seen to happen. At most a quarter of the images.
         """
         count = len(self.xy)
+        if sum(self.agree(i, i + 1) for i in range(count - 1)) < RELIABLE * (count - 1):
+            return []
         against = [i for i in range(count - 1) if self.contradict(i, i + 1)]
         found: dict[int, float] = {}
         for length in range(1, min(LONGEST, count // 4) + 1):

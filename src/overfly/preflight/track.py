@@ -28,6 +28,9 @@ LEAST_SECOND = 0.2
 NEAR = 6
 """Steps around a position that tell to which lines it belongs."""
 
+SPACINGS_DIFFER = 0.15
+"""By how much of itself a turn differs from those of lines in another direction."""
+
 MORE_THAN_ELSEWHERE = 1.5
 """Where a flight has no lines, its ends may turn so many times more than it does elsewhere."""
 
@@ -172,7 +175,9 @@ def _onwards(layout: Layout, elsewhere: Array) -> Array:
         others = np.concatenate([moved[own], elsewhere])
         if turns[i - 1] and not back[i] and len(others):
             # A turn like it, or from the end of a line to any place of the next.
-            turned[i] = np.linalg.norm(others - moved[i - 1], axis=1).min()
+            off = np.linalg.norm(others - moved[i - 1], axis=1)
+            off[own.sum() :] -= SPACINGS_DIFFER * float(np.hypot(along, across))
+            turned[i] = max(0.0, off.min())
             goes_on = i + 1 == len(away) or (not turns[i] and abs(moved[i, 0] - step) < step / 2)
             if goes_on and (i == 1 or not turns[i - 2]):
                 beside = float(np.abs(others[:, 1] - across).min())
