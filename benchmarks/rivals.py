@@ -7,9 +7,10 @@
     pycolmap_held    the same, focal length held at EXIF's
     ppg              pyarchinit-photogrammetry's command in an environment of its own, all defaults, cloud only
 
-Every cloud is laid upon the true surface by the best similarity, since GPS leaves the whole block metres off, and
-measured as in ``benchmarks/flights.py``. ``camera_px`` is how far the placed cameras see points of the ground from
-where the true ones do, median, after the best similarity of all cameras at once. Core-seconds are of all threads.
+Every cloud is laid upon the true surface by the best similarity of its measured points, since GPS leaves the whole
+block metres off, and measured as in ``benchmarks/flights.py``. ``camera_px`` is how far the placed cameras see points
+of the ground from where the true ones do, median, after the best similarity of all cameras at once. Core-seconds are
+of all threads.
 Finished flights, clouds and figures in --work are kept. Writes rivals.csv, rivals.md and rivals.png.
 """
 
@@ -143,8 +144,9 @@ def figures(method: str, case: Case, ppg: str | None, *, anew: bool) -> dict[str
             (out / "cost.json").write_text(json.dumps(run(method, case, out, ppg)))
         row |= json.loads((out / "cost.json").read_text())
         cloud, cameras = local_cloud(case, out / "cloud.laz"), found_cameras(method, out)
-        _, points = align(cloud.points, case.reference[0], "similarity")
-        row |= measure(case, cloud.with_points(points))
+        measured = cloud if cloud.predicted is None else cloud[~cloud.predicted]
+        matrix, _ = align(measured.points, case.reference[0], "similarity")
+        row |= measure(case, cloud.with_points(transform(matrix, cloud.points)))
         row |= {"placed": len(cameras) or None, "camera_px": camera_error(case, cameras)}
     except RuntimeError as error:
         row["failed"] = str(error)
