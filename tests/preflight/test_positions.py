@@ -64,6 +64,16 @@ def test_every_second_image_missing_is_no_fault_of_positions(count, seed):
     assert strays(noisy(lines([count] * 4), seed)[::2], None) == []
 
 
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("last", [1, 2, 3, 5])
+def test_lines_flown_in_two_directions_are_no_faults(last, seed):
+    north, east = lines([5, 5, 5, 5]), lines([5, 5, last], spacing=60.0)[:, ::-1] + [-20, 40]
+    assert strays(noisy(np.concatenate([north, east]), seed), None) == []
+    wrong = noisy(np.concatenate([north, east]), seed)
+    wrong[22] += [0, 44]
+    assert [k for k, _ in strays(wrong, None)] == [22]
+
+
 @pytest.mark.parametrize("i", [0, 1, 8, 9, 18, 19])
 @pytest.mark.parametrize("away", [(30.0, 0.0), (0.0, 30.0), (-30.0, 20.0)])
 def test_an_error_that_no_line_explains_is_told_on_short_lines(i, away):
@@ -165,6 +175,17 @@ def test_one_wrong_match_of_pictures_accuses_nobody():
     for wrong in range(23):
         evidence = Evidence(xy, lambda i, j, k=wrong: np.array([30.0, 2.0]) if (i, j) == (k, k + 1) else xy[j] - xy[i])
         assert evidence.accused() == []
+
+
+def test_where_few_pictures_can_be_compared_they_accuse_nobody():
+    """Two wrong matches that agree by chance: told where the others agree with the positions, not where most do not."""
+    xy = grid()
+    wrong = {(9, 10): np.array([30.0, -9.0]), (10, 11): np.array([-30.0, -9.0])}
+    sure = Evidence(xy, lambda i, j: wrong.get((i, j), xy[j] - xy[i] if j == i + 1 else None))
+    unsure = Evidence(xy, lambda i, j: wrong.get((i, j), xy[j] - xy[i] if j == i + 1 < 8 else None))
+    assert [i for i, _ in sure.accused()] == [10]
+    assert unsure.scale == pytest.approx(1)
+    assert unsure.accused() == []
 
 
 def test_pictures_that_disagree_among_each_other_say_nothing():
