@@ -242,6 +242,7 @@ def test_a_moved_flight_is_still_the_same(tmp_path: Path) -> None:
         ({"size": 10}, "--size 10"),
         ({"mesh": True, "mesh_faces": 3}, "^--mesh-faces 3 is not possible: give 100 to"),
         ({"mesh_faces": 5000}, "add --mesh"),
+        ({"mesh": True, "max_memory_gb": 1}, "A mesh of 200000 triangles takes about 1.2 GB, more than --max-memory 1"),
     ],
 )
 def test_wrong_settings_are_refused_before_anything_is_written(

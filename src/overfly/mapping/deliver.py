@@ -154,7 +154,7 @@ def _mesh(
     try:
         made = write_textured_mesh(
             path,
-            without_spikes(rough_mesh(few, faces=faces)),
+            without_spikes(rough_mesh(Cloud(few.points, few.colors), faces=faces)),
             views,
             gains,
             place=lambda points: georeferenced(Cloud(points), block).points,

@@ -70,14 +70,16 @@ def _spread(photo: NDArray, share: NDArray, neighbours: NDArray) -> NDArray[np.f
     known = neighbours >= 0
     count = 1 + known.sum(1, keepdims=True, dtype=np.float32)
     # The place of a candidate among the neighbour's, the same in every round; the spare last one holds 0.
-    place = np.full((len(photo), 3, CANDIDATES), CANDIDATES, np.int64)
+    place = np.full((len(photo), 3, CANDIDATES), CANDIDATES, np.int32)
     for k in range(CANDIDATES):
         same = (photo[neighbours] == photo[:, None, k, None]) & known[..., None] & (photo[:, k] >= 0)[:, None, None]
         place[:, :, k] = np.where(same.any(2), same.argmax(2), CANDIDATES)
-    place += np.maximum(neighbours, 0)[..., None].astype(np.int64) * (CANDIDATES + 1)
+    place += np.maximum(neighbours, 0)[..., None] * np.int32(CANDIDATES + 1)
     for _ in range(SPREAD):
         padded = np.pad(value, ((0, 0), (0, 1))).ravel()
-        value = np.asarray((value + padded[place].sum(1)) / count, np.float32)
+        for side in range(3):
+            value += padded[place[:, side]]
+        value /= count
     return value
 
 

@@ -26,6 +26,10 @@ MATCHED, COMPARED, HELD = 270, 160, 24
 PER_POINT, PER_SAMPLE = 280, 400
 """Bytes per point of a tile while it is thinned, and of the sample by which figures and pictures are made; measured."""
 
+MESH_GB, PER_FACE = 0.8, 2200
+"""GB while a mesh is textured (program, sample, one photograph, one page), and bytes per face while its grid is made;
+measured."""
+
 PHOTOGRAPHS = 512e6
 """Bytes of decoded images that the orthophoto keeps at most (:class:`overfly.mapping.orthophoto.Orthophoto`)."""
 
@@ -92,6 +96,11 @@ def memory_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -
 def least_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
     """Memory that a map takes with the smallest tiles and the fewest images in memory, GB."""
     return _needed(sizes, matched_side, network, TILE_POINTS[0], HELD_MAPS[0], SAMPLE[0], 1)
+
+
+def mesh_gb(faces: int) -> float:
+    """Memory that a textured mesh of so many triangles takes, whatever the number of images, GB."""
+    return MESH_GB + PER_FACE * faces / 1e9
 
 
 def cores() -> int:

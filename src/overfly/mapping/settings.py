@@ -8,6 +8,7 @@ from typing import Any
 from overfly.errors import InputError, unknown
 from overfly.geodesy import vertical_crs
 from overfly.mapping.matches import MATCHERS
+from overfly.mapping.needs import mesh_gb
 from overfly.mapping.survey import CONTROL
 from overfly.mapping.sweep import TrainedRun
 
@@ -20,8 +21,8 @@ SIZE = 1600
 MESH_FACES = 200_000
 """Default of the triangles of the textured mesh."""
 
-FACES = (100, 2_000_000)
-"""Fewest and most of them: less shows no landscape, more fits into no viewer."""
+FACES = (100, 1_000_000)
+"""Fewest and most of them: less shows no landscape, more fits into few viewers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +103,12 @@ class MapSettings:
                 )
         if self.max_memory_gb is not None and not self.max_memory_gb > 0:
             raise InputError(f"--max-memory {self.max_memory_gb} is not possible: give gigabytes above 0, such as 4.")
+        needed = mesh_gb(self.mesh_faces or MESH_FACES)
+        if self.mesh and self.max_memory_gb is not None and needed > self.max_memory_gb:
+            raise InputError(
+                f"A mesh of {self.mesh_faces or MESH_FACES} triangles takes about {needed:.1f} GB, more than "
+                f"--max-memory {self.max_memory_gb:g}: allow so much, or give fewer --mesh-faces."
+            )
 
     def shown(self) -> dict[str, Any]:
         """For the report and map.json."""
