@@ -14,7 +14,10 @@ from overfly.preflight.images import THUMBNAIL, Look
 
 WIDTH = THUMBNAIL // 2
 """Width of the pictures compared, pixels: coarse, so that trees and houses, which shift more than the ground, stay in
-one cell, and 500 images take one second."""
+one cell, and 500 images that look down take two seconds, oblique ones five."""
+
+LARGEST = 224
+"""Cells along a side of the raster that holds a picture, at most: oblique ones are cut off far away."""
 
 FINE = 1.5
 """Sigma of the filter that leaves the details, pixels."""
@@ -29,10 +32,11 @@ LEAST_SHARED = 0.15
 """Share of a picture that two must have in common: less matches by chance."""
 
 CLEAR, CLEAR_RATIO = 0.2, 1.3
-"""Correlation, and its ratio to the second best place, from which a displacement counts: on 38 rendered flights of all
-paths and 30 to 80 % overlap, hills and trees among them, 1 in 100 is then off by more than a fifth of the picture."""
+"""Correlation, and its ratio to the second best place, from which a displacement counts. On 89 rendered flights of all
+paths, with hills and trees and 30 to 80 % overlap, 6 of 1231 displacements between neighbours were then wrong, and 28
+of 691 between every second image."""
 
-ODDEST_TILT = 0.64
+LEAST_DOWN = 0.64
 """Cosine off straight down (50 degrees) beyond which the picture of level ground says nothing."""
 
 
@@ -65,6 +69,7 @@ class Displacements:
         self.placed, self.looks = placed, looks
         widths = np.array([c.width / c.fx for c in placed.cameras])
         self.cell = float(np.median(placed.heights) * np.median(widths)) / WIDTH
+        self._size = _raster_size(placed, self.cell)
         self._pictures: dict[int, GroundPicture | None] = {}
         self._known: dict[tuple[int, int], Array | None] = {}
 
@@ -92,7 +97,7 @@ class Displacements:
 
         thumbnail, camera, world = self.looks[i].thumbnail, self.placed.cameras[i], self.placed.poses[i]
         height, ahead = float(self.placed.heights[i]), world[:3, 2]
-        if thumbnail is None or self.placed.frames[i].gimbal is None or ahead[2] > -ODDEST_TILT or height <= 0:
+        if thumbnail is None or self.placed.frames[i].gimbal is None or ahead[2] > -LEAST_DOWN or height <= 0:
             return None
         small = cv2.resize(thumbnail, (WIDTH, max(8, round(WIDTH * camera.height / camera.width))),
                            interpolation=cv2.INTER_AREA)  # fmt: skip
@@ -105,7 +110,7 @@ class Displacements:
         details = details / (np.sqrt(smooth(details * details)) + LEAST_NOISE)
         inner = np.zeros_like(small)
         inner[BORDER:-BORDER, BORDER:-BORDER] = 1
-        size = _raster_size(camera.width / camera.fx, camera.height / camera.fx, float(-ahead[2]), self.cell, height)
+        size = self._size
         offset = np.round(ahead[:2] / -ahead[2] * height / self.cell) * self.cell
         scale = WIDTH / camera.width
         pixel = np.array([[camera.fx * scale, 0, camera.cx * scale], [0, camera.fy * scale, camera.cy * scale],
@@ -121,17 +126,21 @@ class Displacements:
         return GroundPicture(spectra, offset, float(mask.sum()))
 
 
-def _raster_size(wide: float, high: float, down: float, cell: float, height: float) -> int:
-    """Cells along a side that hold the footprint; one of few sizes, so that images of one flight can be compared."""
-    diagonal = np.hypot(wide, high) * height / cell / max(down, ODDEST_TILT) ** 2
-    return 112 if diagonal <= 112 else 224
+def _raster_size(placed: Placement, cell: float) -> int:
+    """Cells along a side that hold most footprints: one size, so that all images of a flight can be compared."""
+    from scipy.fft import next_fast_len
+
+    diagonals = np.array([np.hypot(c.width, c.height) / c.fx for c in placed.cameras]) * np.maximum(placed.heights, 0)
+    down = np.maximum(-placed.poses[:, 2, 2], LEAST_DOWN)
+    most = float(np.percentile(diagonals / down**2, 90)) / cell
+    return min(next_fast_len(int(np.ceil(most)), real=True), LARGEST)
 
 
 def _displacement(a: GroundPicture, b: GroundPicture, cell: float) -> Array | None:
     """Normalised cross correlation of what both see, at all displacements (Padfield, Masked object registration)."""
     from scipy.fft import irfft2
 
-    if a.spectra[0].shape != b.spectra[0].shape or min(a.area, b.area) == 0:
+    if min(a.area, b.area) == 0:
         return None
     size = a.spectra[0].shape[0]
 
