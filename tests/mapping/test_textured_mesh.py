@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from conftest import ORIGIN, bar, nadir
 from overfly.cloud import Cloud
 from overfly.errors import InputError
 from overfly.geodesy import crs_from_enu, enu_from_crs
+from overfly.mapping.atlas import lay_out
 from overfly.mapping.gains import Gains
 from overfly.mapping.rough_mesh import rough_mesh
 from overfly.mapping.textured_mesh import write_textured_mesh
@@ -223,6 +225,21 @@ def test_light_that_falls_off_over_the_image_leaves_no_seams(
     assert len(even) == len(raw) > 50
     assert raw.mean() > 4
     assert even.mean() < 0.5 * raw.mean()
+
+
+def test_what_does_not_fit_at_full_size_is_scaled_and_lies_on_several_pages(
+    tmp_path: Path, mesh: Mesh, frames: list, textured: tuple[Path, dict], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("overfly.mapping.textured_mesh.lay_out", partial(lay_out, side=128, pages=3))
+    facts = written(tmp_path / "mesh.glb", mesh, frames)
+    assert 0.3 < facts["texture_scale"] < 1
+    assert 2 <= len(facts["texture_px"]) <= 3
+    assert max(max(size) for size in facts["texture_px"]) == 128
+    surface = read(tmp_path / "mesh.glb")
+    assert surface.faces == len(mesh.faces)
+    assert facts["textured_share"] == textured[1]["textured_share"]
+    flat = level(surface, surface.points[:, :2])
+    assert np.abs(surface.colors - truth(surface.points[:, :2]))[flat].mean() < 5
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path, textured: tuple[Path, dict], mesh: Mesh, frames) -> None:
