@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from overfly.mapping.seams import FADE, PARTS, blurred, cut_field, field, movements
+from overfly.mapping.seams import FADE, FLOOR, PARTS, cut_field, field, movements, toned, tones_at
 
 
 def two_charts(n: int = 60) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -23,26 +23,26 @@ def two_charts(n: int = 60) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_what_differs_at_the_seam_agrees_and_what_is_far_stays() -> None:
     n = 200
     vertex, faces, away = two_charts(n)
-    colors = np.repeat([[100.0, 90, 80], [112.0, 90, 76]], n * n, axis=0)
+    colors = np.repeat([[4.6, 4.5, 4.4], [4.72, 4.5, 4.36]], n * n, axis=0)
     moved = movements(colors, vertex, faces)
     left, right = moved[: n * n], moved[n * n :]
     at = away[: n * n] == 0, away[n * n :] == 0
-    np.testing.assert_allclose(left[at[0]] - right[at[1]], np.tile([12.0, 0, -4], (n, 1)), atol=0.5)
-    np.testing.assert_allclose(left[at[0]].mean(0), [6, 0, -2], atol=0.3)
+    np.testing.assert_allclose(left[at[0]] - right[at[1]], np.tile([0.12, 0, -0.04], (n, 1)), atol=0.005)
+    np.testing.assert_allclose(left[at[0]].mean(0), [0.06, 0, -0.02], atol=0.003)
     far = away[: n * n] > 3 * FADE
-    assert np.abs(left[far]).max() < 0.06 * 6
-    assert np.abs(np.diff(left[:, 0].reshape(n, n), axis=1)).max() < 0.3  # no step of its own
+    assert np.abs(left[far]).max() < 0.06 * 0.06
+    assert np.abs(np.diff(left[:, 0].reshape(n, n), axis=1)).max() < 0.003  # no step of its own
 
 
 def test_a_roof_against_the_ground_moves_neither() -> None:
     vertex, faces, _ = two_charts()
-    colors = np.repeat([[170.0, 60, 50], [70.0, 130, 60]], len(vertex) // 2, axis=0)
+    colors = np.repeat(np.log([[186.0, 76, 66], [86.0, 146, 76]]), len(vertex) // 2, axis=0)
     assert np.abs(movements(colors, vertex, faces)).max() < 1e-6
 
 
 def test_vertices_without_a_photograph_are_not_moved() -> None:
     vertex, faces, _ = two_charts()
-    colors = np.repeat([[100.0, 90, 80], [np.nan] * 3], len(vertex) // 2, axis=0)
+    colors = np.repeat([[4.6, 4.5, 4.4], [np.nan] * 3], len(vertex) // 2, axis=0)
     np.testing.assert_array_equal(movements(colors, vertex, faces), 0)
 
 
@@ -65,7 +65,15 @@ def test_the_field_is_linear_between_vertices_and_continued_a_little() -> None:
 def test_colours_are_averaged_over_their_surroundings() -> None:
     image = np.zeros((40, 60, 3), np.uint8)
     image[:, 30:] = [200, 100, 50]
-    found = blurred(image, np.array([[30.5, 20], [10, 20], [50, 20], [70, 20]]), 4.8)
-    assert found[0, 0] == pytest.approx(200 * 3 / 5, abs=1)
-    np.testing.assert_allclose(found[1:3], [[0, 0, 0], [200, 100, 50]])
+    found = tones_at(image, np.array([[30.5, 20], [10, 20], [50, 20], [70, 20]]), 4.8)
+    assert found[0, 0] == pytest.approx(np.log(200 * 3 / 5 + FLOOR), abs=0.01)
+    np.testing.assert_allclose(found[1:3], np.log([[FLOOR] * 3, [200 + FLOOR, 100 + FLOOR, 50 + FLOOR]]))
     assert np.isnan(found[3]).all()
+
+
+def test_moved_tones_keep_shadows() -> None:
+    colors = np.array([[4, 100, 250]], np.uint8)
+    assert toned(colors, np.zeros((1, 3), np.float32)).tolist() == colors.tolist()
+    darker = toned(colors, np.full((1, 3), -0.15, np.float32))
+    assert darker.tolist() == [[1, 84, 213]]
+    assert toned(colors, np.full((1, 3), 0.15, np.float32))[0, 2] == 255

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.geometry import Array
-from overfly.mapping.seams import cut_field
+from overfly.mapping.seams import cut_field, toned
 from overfly.mapping.visibility import Image
 
 PAGE = 8192
@@ -162,7 +162,7 @@ def paint(
     Args:
         layout: of the charts.
         pictures: that their boxes are cut from.
-        movements: of a picture's colours, see :func:`overfly.mapping.seams.field`; None where it has none.
+        movements: of a picture's tones, see :func:`overfly.mapping.seams.field`; None where it has none.
         ground: [3] the colour between the boxes.
         progress: told (done, in all).
     """
@@ -180,7 +180,7 @@ def paint(
                 (x, y), (w, h) = layout.place[c], boxes.size[c]
                 box = _cut(image, boxes.corner[c], boxes.size[c])
                 if moved is not None:
-                    box = np.rint(np.clip(box + cut_field(moved, boxes.corner[c], boxes.size[c], layout.scale), 0, 255))
+                    box = toned(box, cut_field(moved, boxes.corner[c], boxes.size[c], layout.scale))
                 canvas[y : y + h, x : x + w] = box[..., ::-1]
             done += 1
             if progress is not None:

@@ -23,7 +23,7 @@ from overfly.mapping.face_labels import charts, choose
 from overfly.mapping.face_views import rank_views
 from overfly.mapping.gains import Gains
 from overfly.mapping.glb import Part, write_glb
-from overfly.mapping.seams import blurred, field, movements
+from overfly.mapping.seams import field, movements, tones_at
 from overfly.mapping.visibility import Image, View
 from overfly.mesh import Mesh
 from overfly.rendering.topology import topology
@@ -183,7 +183,7 @@ def _tones(
     scale: float,
     progress: Callable[[int, int], None],
 ) -> Array:
-    """Colours of the charts' vertices [W, 3], averaged over a side of their faces; NaN where no photograph is."""
+    """Tones of the charts' vertices [W, 3], averaged over a side of their faces; NaN where no photograph is."""
     tones = np.full((len(pixels), 3), np.nan)
     for i, photograph in enumerate(photographs):
         mine = np.flatnonzero(owner == i)
@@ -191,7 +191,7 @@ def _tones(
             sides = pixels[face[owner[face[:, 0]] == i]]
             width = float(np.median(np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1)))
             size = scaled(photograph.size, scale)
-            tones[mine] = blurred(photograph.read(size), pixels[mine] * scale, width * scale)
+            tones[mine] = tones_at(photograph.read(size), pixels[mine] * scale, width * scale)
         progress(i + 1, len(photographs))
     return tones
 
@@ -199,7 +199,7 @@ def _tones(
 def _field(
     photographs: Sequence[Picture], owner: NDArray, pixels: Array, face: NDArray, moved: Array, i: int
 ) -> NDArray[np.float32] | None:
-    """How the colours of picture ``i`` are moved; those of the cloud are not."""
+    """How the tones of picture ``i`` are moved; those of the cloud are not."""
     if i >= len(photographs):
         return None
     used, faces = np.unique(face[owner[face[:, 0]] == i], return_inverse=True)
