@@ -30,7 +30,7 @@ from overfly.mapping.rectify import ordered, rectify
 GPS_M = 5.0
 """Largest distance from its GPS position at which a camera agrees with it."""
 
-CANVAS_PX = 20_000
+CANVAS_PX = 8_000
 """Wider canvases come from cameras that are wrong."""
 
 
@@ -119,6 +119,8 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     model = reconstruct(flight, out, held="held" in sys.argv[3:])
     surface = np.array([p.xyz for p in model.points3D.values()])
+    low, high = np.quantile(surface[:, 2], [0.02, 0.98])  # single points far below would ask for depths without end
+    surface = surface[(surface[:, 2] >= low) & (surface[:, 2] <= high)]
     write_cloud(dense(flight.root / "images", cameras_of(model), surface), out / "cloud.laz")
     print(f"{model.num_reg_images()} images placed")
 

@@ -31,7 +31,7 @@ FOCAL_SIGMA = 0.02
 GAIN = 0.01
 """Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
 
-NO_LENS_SIGMA = 0.001
+NO_LENS_SIGMA = 0.0001
 """Standard deviation of k1 and k2 until the images ask for a lens."""
 
 LOOSE = 10.0
