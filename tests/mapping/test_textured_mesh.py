@@ -182,6 +182,16 @@ def test_what_no_photograph_sees_keeps_the_colours_of_the_cloud_and_is_told(tmp_
     assert surely < facts["textured_share"] < perhaps
 
 
+def test_photographs_of_another_place_leave_the_colours_of_the_cloud(tmp_path: Path, mesh: Mesh) -> None:
+    elsewhere = house.frames(tmp_path, [nadir(1000.0, 0.0, house.ALTITUDE), nadir(0.0, 0.0, -50.0)])
+    facts = written(tmp_path / "mesh.glb", mesh, elsewhere)
+    assert facts["textured_share"] == 0
+    surface = read(tmp_path / "mesh.glb")
+    flat = level(surface, surface.points[:, :2])
+    assert np.abs(surface.colors - truth(surface.points[:, :2]))[flat].mean() < 12
+    assert surface.colors.min() > 5
+
+
 def test_exposures_are_evened_by_the_gains(tmp_path: Path, mesh: Mesh) -> None:
     exposures = dict.fromkeys(range(0, 12, 2), 0.6)
     frames = house.frames(tmp_path, exposures=exposures)
