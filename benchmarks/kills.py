@@ -23,8 +23,6 @@ from pathlib import Path
 import numpy as np
 
 SAME = ("cloud.laz", "dsm.tif", "orthophoto.tif", "transforms.json")
-START_S = 2.0
-"""About what a process takes before it does anything that could be lost."""
 
 
 def fingerprints(folder: Path) -> dict[str, str]:
@@ -38,10 +36,10 @@ def start(command: list[str], log: Path) -> subprocess.Popen:
         return subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True)
 
 
-def last_step(log: Path) -> str:
-    """The last step that a map told of."""
-    lines = log.read_text(errors="replace").replace("\r", "\n").strip().splitlines()
-    return next((line.split()[0] for line in reversed(lines) if line.split()), "start")
+def last_step(log: Path, since: int) -> str | None:
+    """The last step that a map told of after so many bytes of its log; None before the first."""
+    lines = log.read_bytes()[since:].decode(errors="replace").replace("\r", "\n").strip().splitlines()
+    return next((line.split()[0] for line in reversed(lines) if line.split()), None)
 
 
 def main() -> None:
@@ -67,16 +65,19 @@ def main() -> None:
     rng, log = np.random.default_rng(asked.seed), asked.out / "killed.log"
     killed: list[str] = []
     while len(killed) < asked.kills:
+        since = log.stat().st_size if log.is_file() else 0
         child = start(command("killed"), log)
+        while child.poll() is None and last_step(log, since) is None:  # nothing can be lost yet
+            time.sleep(0.05)
         # Twice the mean share of what is to be done, so that the kills are spread from the first step to the last.
-        wait = START_S + rng.uniform(0, 2 * whole / asked.kills)
+        wait = rng.uniform(0, 2 * whole / asked.kills)
         try:
             code = child.wait(timeout=wait)
         except subprocess.TimeoutExpired:
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
-            killed.append(last_step(log))
-            print(f"killed after {wait:.1f} s, at: {killed[-1]}", flush=True)
+            killed.append(last_step(log, since) or "")
+            print(f"killed {wait:.1f} s after it read the flight, the last it told was: {killed[-1]}", flush=True)
             continue
         if code:
             raise SystemExit(log.read_text())
