@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ import trimesh
 from conftest import ORIGIN, bar, nadir
 from overfly.cloud import Cloud
 from overfly.errors import InputError
+from overfly.flights import Frame
 from overfly.geodesy import crs_from_enu, enu_from_crs
 from overfly.mapping.atlas import lay_out
 from overfly.mapping.gains import Gains
@@ -166,6 +168,32 @@ def test_ground_behind_the_house_does_not_take_the_colour_of_the_roof(tmp_path: 
     assert off < 8
     on_roof = (surface.points[:, 2] > house.HEIGHT - 0.01) & (np.abs(surface.points[:, :2]) < house.HALF - 0.5).all(1)
     assert (surface.colors[on_roof, 0] - surface.colors[on_roof, 1] > 60).mean() > 0.99
+
+
+def test_a_roof_that_the_mesh_has_too_small_is_not_laid_on_the_ground_behind_it(tmp_path: Path) -> None:
+    """Where the mesh's shadow ends before the true one, the photograph that looks past the edge shows the roof."""
+    cloud = ground()
+    eaves = house.on_roof(cloud.points[:, :2]) & (cloud.points[:, 0] > house.HALF[0] - 0.2)
+    cloud.points[eaves, 2] = 0
+    written(tmp_path / "mesh.glb", rough_mesh(cloud, faces=12_000), house.frames(tmp_path, hidden_side()))
+    surface = read(tmp_path / "mesh.glb")
+    x, y, _ = surface.points.T
+    band = (surface.up > 0.99) & (x > 8.3) & (x < 8.6) & (np.abs(y) < 3)
+    assert band.sum() > 100
+    assert green(surface.colors[band]).mean() > 0.9
+
+
+def test_the_lens_is_honoured(tmp_path: Path, mesh: Mesh) -> None:
+    camera, pose = replace(house.CAMERA, k1=-0.3), nadir(0.0, 0.0, house.ALTITUDE)
+    path = tmp_path / "barrel.png"
+    cv2.imwrite(str(path), house.photograph(camera, pose)[..., ::-1])
+    frame = Frame(path.name, path, camera.width, camera.height, camera, pose)
+    written(tmp_path / "mesh.glb", mesh, [frame])
+    surface = read(tmp_path / "mesh.glb")
+    xy = surface.points[:, :2]
+    shown = level(surface, xy) & (np.hypot(*xy.T) > 13) & (np.abs(xy) < [17, 14]).all(1)  # off by 1 m without
+    assert shown.sum() > 2000
+    assert np.abs(surface.colors - truth(xy))[shown].mean() < 3
 
 
 def test_what_no_photograph_sees_keeps_the_colours_of_the_cloud_and_is_told(tmp_path: Path) -> None:

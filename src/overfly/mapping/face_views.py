@@ -30,9 +30,9 @@ BUFFER = 1024
 SLACK = 3.0
 """A point is hidden that lies more than this many buffer pixels, on the ground, behind what is seen."""
 
-HEM = (2, 15)
-"""Least and most buffer pixels around a point, otherwise a cell of the mesh, in which nothing should stand before it:
-the edges of a mesh are off by as much, and a photograph that sees a face close behind one may show the roof there."""
+HEM, LEAST, MOST = 1.5, 2, 20
+"""Cells of the mesh around a point, and least and most buffer pixels, in which nothing should stand before it: edges of
+roofs are off by as much, and a photograph that sees a face close behind one may show the roof there."""
 
 STEP = 2.0
 """Cells by which something stands before a point, and not only beside it on a slope."""
@@ -186,7 +186,7 @@ class _DepthBuffer:
         # A pixel's centre at the edge of a roof may see the roof where the point beside it is free.
         self.farthest = cv2.dilate(depths, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
         shown = depths[depths < NOTHING]
-        hem = 2 * int(np.clip(cell * plane.focal / np.median(shown), *HEM)) + 1 if len(shown) else 1
+        hem = 2 * int(np.clip(HEM * cell * plane.focal / np.median(shown), LEAST, MOST)) + 1 if len(shown) else 1
         self.nearest = cv2.erode(depths, np.ones((hem, hem), np.uint8), borderType=cv2.BORDER_REPLICATE)
 
     def look(self, points: Array) -> tuple[NDArray[np.bool_], Array]:
