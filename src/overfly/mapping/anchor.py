@@ -1,10 +1,14 @@
-"""What one image alone suggests, moved so that it meets what has been measured around it.
+"""What one image alone suggests, laid on the surface that has been measured around it.
 
-A network that sees a place once knows what stands on the ground better than how high the ground is: roofs from lawns,
-but not a slope. Measured ground beside it tells the slope, and where the network tends to err.
+A network that sees a place once knows what stands on the ground, roughly, and not how high the ground is: where it was
+followed, even with its mean error taken off, plain interpolation between the measured places was nearer to the truth.
+So the measured surface is carried on smoothly, and only what rises clearly over its surroundings is taken from the
+network, shrunk, since it is wrong as often as right.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,48 +16,91 @@ from numpy.typing import NDArray
 Map = NDArray[np.float32]
 
 CELLS = 24
-"""Cells along the longer side in which the difference is taken: smaller than a block, larger than a house."""
+"""Cells along the longer side, of which the measured median is taken: smaller than a block, larger than a house."""
 
-SHARE = 0.15
-"""Of a cell's pixels, this many must be measured for its median to count."""
+SHARE = 0.4
+"""Of a cell's pixels, this many must be measured for its median to count: roofs alone are no ground."""
 
-REACHES = (1.0, 3.0, 9.0)
-"""Standard deviations of the smoothing, cells: near cells decide, far ones where there are no near ones."""
+BENDING, SLOPING = 0.5, 0.02
+"""Weights of second and first differences between cells against a wholly measured cell."""
+
+OUTLIER, ROUNDS = 0.005, 6
+"""Share of the camera's height over the surface by which a cell may miss the plate at full weight, and how often cells
+are weighed anew: a roof or a wood beside a gap says little of the ground in it."""
+
+TALL = 0.03
+"""Share of the camera's height over the surface by which something must rise over its surroundings to be believed."""
+
+SHRUNK = 0.7
+"""Part of its height that it gets: what is wrong half of the time is best told lower than it seems."""
+
+SURROUNDINGS = 4
+"""Cells across which what stands on the ground is told from the ground."""
 
 
 def anchored(suggested: Map, measured: Map) -> Map:
     """Heights of a frame's pixels from a suggestion and measurements.
 
     Args:
-        suggested: [h, w], metres, NaN where nothing is suggested.
-        measured: [h, w], metres, NaN where nothing is measured.
+        suggested: [h, w], metres over the camera (negative below it), finite.
+        measured: [h, w], the same, NaN where nothing is measured.
 
     Returns:
-        [h, w]: the suggestion plus the smooth part of what the measurements differ from it by, which is carried on
-        beyond them; the suggestion itself where nothing at all is measured.
+        [h, w]: a thin plate through the medians of the measured cells (Duchon 1977), and on it what the suggestion lets
+        rise over its surroundings; the suggestion itself where too little is measured.
     """
     import cv2
-    from scipy.ndimage import gaussian_filter
 
     h, w = suggested.shape
     size = max(1, round(max(h, w) / CELLS))
+    medians, weights = _cells(measured, size)
+    if not weights.any():
+        return suggested
+    rows, columns = medians.shape
+    plate = _plate(medians, weights).astype(np.float32)
+    surface = cv2.resize(plate, (columns * size, rows * size), interpolation=cv2.INTER_CUBIC)[:h, :w]
+    kernel = np.ones((SURROUNDINGS * size | 1,) * 2, np.uint8)
+    ground = cv2.GaussianBlur(cv2.morphologyEx(suggested, cv2.MORPH_OPEN, kernel), (0, 0), size)
+    rise = suggested - ground
+    return np.asarray(surface + np.where(rise > TALL * np.abs(surface), SHRUNK * rise, 0), np.float32)
+
+
+def _cells(measured: Map, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Median and measured share of each cell; both 0 where too little is measured."""
+    h, w = measured.shape
     rows, columns = -(-h // size), -(-w // size)
     medians, weights = np.zeros((rows, columns)), np.zeros((rows, columns))
-    difference = measured - suggested
     for row in range(rows):
         for column in range(columns):
-            cell = difference[row * size : (row + 1) * size, column * size : (column + 1) * size]
+            cell = measured[row * size : (row + 1) * size, column * size : (column + 1) * size]
             known = cell[np.isfinite(cell)]
             if len(known) >= SHARE * cell.size:
                 medians[row, column], weights[row, column] = np.median(known), len(known) / cell.size
-    if not weights.any():
-        return suggested
-    total, weight = np.zeros_like(medians), np.zeros_like(medians)
-    for k, reach in enumerate(REACHES):
-        share = 0.03**k
-        total += share * gaussian_filter(weights * medians, reach, mode="constant")
-        weight += share * gaussian_filter(weights, reach, mode="constant")
-    everywhere = (weights * medians).sum() / weights.sum()
-    field: NDArray = (total + 1e-6 * everywhere) / (weight + 1e-6)
-    wide = cv2.resize(field.astype(np.float32), (columns * size, rows * size), interpolation=cv2.INTER_LINEAR)
-    return suggested + wide[:h, :w]
+    return medians, weights
+
+
+def _plate(medians: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The thin plate [rows, columns] through weighted values, those that miss it weighed less (Huber's weights)."""
+    from scipy.sparse import diags_array, eye_array, kron
+    from scipy.sparse.linalg import spsolve
+
+    def differences(n: int, order: int) -> Any:
+        pattern = {1: [-1.0, 1.0], 2: [1.0, -2.0, 1.0]}[order]
+        return diags_array(pattern, offsets=list(range(order + 1)), shape=(max(n - order, 0), n))
+
+    def squared(down: Any, along: Any) -> Any:
+        both = kron(down, along)
+        return both.T @ both
+
+    rows, columns = medians.shape
+    stay = eye_array(rows), eye_array(columns)
+    first, second = ((differences(rows, k), differences(columns, k)) for k in (1, 2))
+    bending = squared(second[0], stay[1]) + squared(stay[0], second[1]) + 2 * squared(*first)
+    sloping = squared(first[0], stay[1]) + squared(stay[0], first[1])
+    stiff = BENDING * bending + SLOPING * sloping
+    limit = OUTLIER * float(np.median(np.abs(medians[weights > 0])))
+    w = weights
+    for _ in range(ROUNDS):
+        plate = spsolve((stiff + diags_array(w.ravel())).tocsc(), (w * medians).ravel()).reshape(rows, columns)
+        w = weights * limit / np.maximum(np.abs(medians - plate), max(limit, 1e-9))
+    return np.asarray(plate)
