@@ -174,6 +174,17 @@ def test_finished_steps_are_reused_and_only_where_nothing_changed(tmp_path: Path
     assert mapped(flight, out)["reused"] == []
 
 
+@pytest.mark.parametrize(("form", "kept"), [("BLOCK_FORM", []), ("DENSE_FORM", ["cameras"])])
+def test_what_an_older_form_kept_is_made_anew(
+    form: str, kept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
+    with monkeypatch.context() as older:
+        older.setattr(f"overfly.mapping.map.{form}", 0)
+        mapped(flight, out)
+    assert mapped(flight, out)["reused"] == kept
+
+
 def test_an_interruption_keeps_what_is_finished(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

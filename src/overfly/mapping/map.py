@@ -24,8 +24,9 @@ from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles, write_tiles
 
-BLOCK_FORM = 3
-"""Of what is kept of a block: one that an older form kept is not read."""
+BLOCK_FORM, DENSE_FORM = 4, 2
+"""Of what the steps keep, half-finished parts included: raised whenever the same images and settings become another
+block, or the same block another cloud, so that a map resumed from an older version's folder mixes nothing."""
 
 FEWEST_POINTS = 30
 """Sparse points that tell the height of the ground."""
@@ -121,7 +122,7 @@ def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -
     block, key = _aligned(flight, identity, asked, steps)
     check_memory(block, asked)
     network = _network_key(asked) if asked.dense == "sweep" else None
-    key = key_of(key, asked.dense, network, asked.seed, *([] if asked.size == SIZE else [asked.size]))
+    key = key_of(key, DENSE_FORM, asked.dense, network, asked.seed, *([] if asked.size == SIZE else [asked.size]))
     make: Callable[[Path], Tiles] = {
         "sweep": lambda scratch: sweep_cloud(block, flight, scratch, asked, steps),
         "stereo": lambda scratch: stereo_cloud(block, scratch, asked, steps),
