@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.files import existing, replacing
-from overfly.geodesy import crs_code
+from overfly.geodesy import crs_code, epsg_codes
 from overfly.ply import read_ply, write_ply_tables
 
 SUFFIXES = (".ply", ".las", ".laz")
@@ -240,14 +240,13 @@ def _crs(header: Any, path: Path) -> tuple[int | None, int | None]:
         raise InputError(f"The CRS in the header of {path} is not readable ({error}): write it again.") from error
     if crs is None:
         return None, None
-    horizontal, vertical = crs.sub_crs_list if crs.is_compound else (crs, None)
     if units := {a.unit_name for a in crs.axis_info} - {"metre", "meter"}:
         raise InputError(
-            f"{path} is in {horizontal.name}, whose unit is {', '.join(sorted(units))}; Overfly works in metres: "
+            f"{path} is in {crs.name}, whose unit is {', '.join(sorted(units))}; Overfly works in metres: "
             "reproject it first, for example with `pdal translate in.laz out.laz reprojection "
             "--filters.reprojection.out_srs=EPSG:32610` and the UTM zone of the place."
         )
-    return horizontal.to_epsg(), None if vertical is None else vertical.to_epsg()
+    return epsg_codes(crs)
 
 
 def _write_las(clouds: Iterator[Cloud], path: Path, count: int, low: NDArray) -> None:

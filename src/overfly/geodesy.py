@@ -5,12 +5,16 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from overfly.errors import InputError
 from overfly.geometry import Array
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 VERTICAL = {"egm96": "5773", "egm2008": "3855"}
 """Vertical CRS that go by a name of their own, worldwide geoids."""
@@ -91,6 +95,12 @@ def _projected(epsg: int, vertical_epsg: int | None = None):
 def crs_code(epsg: int, vertical_epsg: int | None = None) -> str:
     """What PROJ, GDAL and LAS headers call a CRS: ``EPSG:32632``, with a vertical one ``EPSG:32632+5773``."""
     return f"EPSG:{epsg}" if vertical_epsg is None else f"EPSG:{epsg}+{vertical_epsg}"
+
+
+def epsg_codes(crs: CRS) -> tuple[int | None, int | None]:
+    """EPSG codes of the horizontal and of the vertical part of a CRS; None where there is none, or no code."""
+    horizontal, vertical = crs.sub_crs_list if crs.is_compound else (crs, None)
+    return horizontal.to_epsg(), None if vertical is None else vertical.to_epsg()
 
 
 def crs_from_enu(points: ArrayLike, origin: Origin) -> Array:

@@ -125,7 +125,7 @@ def test_a_cloud_in_a_crs_gets_its_origin(tmp_path: Path) -> None:
     assert np.median(top) == pytest.approx(corner[2], abs=0.1)
 
 
-def write_dsm(path: Path, z: np.ndarray, *, epsg: int | None = 32632, cell: float = 0.5, bands: int = 1) -> None:
+def write_dsm(path: Path, z: np.ndarray, *, epsg: int | str | None = 32632, cell: float = 0.5, bands: int = 1) -> None:
     rasterio = pytest.importorskip("rasterio")
     from affine import Affine
 
@@ -159,6 +159,13 @@ def test_a_height_raster_with_its_orthophoto(tmp_path: Path) -> None:
     assert np.isnan(corner).all()  # NaN cells stay empty
     other = load_scene(tmp_path / "area.tif", orthophoto=tmp_path / "area_ortho.tif")
     np.testing.assert_array_equal(other.texture, scene.texture)
+
+
+def test_a_raster_of_heights_above_the_sea_has_its_place_on_the_earth(tmp_path: Path) -> None:
+    write_dsm(tmp_path / "sea.tif", np.full((100, 100), 7.0, np.float32), epsg="32632+5773")
+    scene = load_scene(tmp_path / "sea.tif")
+    assert scene.origin is not None
+    assert (scene.origin.epsg, scene.origin.height) == (32632, 7.0)
 
 
 def test_a_raster_without_crs_is_in_its_own_metres(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.flights import ControlPoint, Flight
-from overfly.geodesy import Origin, enu_from_geodetic, vertical_crs
+from overfly.geodesy import Origin, enu_from_geodetic, epsg_codes, vertical_crs
 from overfly.geometry import Array, fit_similarity, transform
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.clicks import Control
@@ -47,9 +47,9 @@ def control_crs(text: str) -> tuple[int | None, int | None]:
     from overfly.flights.odm import crs_name
 
     crs = CRS.from_user_input(crs_name(text))
-    horizontal, vertical = crs.sub_crs_list if crs.is_compound else (crs, None)
-    metres = horizontal.is_projected and all(axis.unit_name == "metre" for axis in horizontal.axis_info[:2])
-    return horizontal.to_epsg() if metres else None, None if vertical is None else vertical.to_epsg()
+    horizontal, vertical = epsg_codes(crs)
+    metres = crs.is_projected and all(axis.unit_name == "metre" for axis in crs.axis_info[:2])
+    return horizontal if metres else None, vertical
 
 
 def _geodetic(point: ControlPoint) -> tuple[float, float, float]:
@@ -69,7 +69,7 @@ def _geodetic(point: ControlPoint) -> tuple[float, float, float]:
             f"The first line of gcp_list.txt must be a CRS that fits the coordinates, such as EPSG:32617, not "
             f"{point.crs!r} ({str(error).splitlines()[0]})."
         ) from error
-    vertical = crs.sub_crs_list[1].to_epsg()
+    vertical = epsg_codes(crs)[1]
     vertical_crs(str(vertical))  # says which grid is missing
     try:
         way = Transformer.from_crs(crs, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.errors import InputError
-from overfly.geodesy import Origin, enu_from_crs
+from overfly.geodesy import Origin, enu_from_crs, epsg_codes
 from overfly.scenes import materials as m
 from overfly.scenes.envelope import lower_envelope, nearest_fill
 from overfly.scenes.scene import Scene
@@ -65,6 +65,7 @@ def _read(path: Path, bands: int, most: int, resampling: Any) -> tuple[np.ma.Mas
     """Bands, their affine transform, EPSG code and metres per vertical unit of a raster, thinned to ``most`` cells."""
     import rasterio
     from affine import Affine
+    from pyproj import CRS
     from rasterio.errors import RasterioError
 
     try:
@@ -79,7 +80,8 @@ def _read(path: Path, bands: int, most: int, resampling: Any) -> tuple[np.ma.Mas
             a, b, c, d, e, f = file.transform[:6]
             across, down = file.width / cols, file.height / rows
             transform = Affine(a * across, b * down, c, d * across, e * down, f)
-            epsg = file.crs.to_epsg() if file.crs else None
+            # Heights are taken as they are, whatever they refer to: rendering asks for no geoid.
+            epsg = epsg_codes(CRS.from_user_input(file.crs))[0] if file.crs else None
             # A DSM in a CRS of feet has its heights in feet too.
             factor = float(file.crs.linear_units_factor[1]) if file.crs and file.crs.is_projected else 1.0
     except RasterioError as error:
