@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from overfly.cloud import read_cloud
 from overfly.errors import InputError
 from overfly.flights import ControlPoint
 from overfly.geodesy import Origin, crs_from_enu
-from overfly.mapping.control import control_origin
+from overfly.mapping.control import control_crs, control_origin
+from overfly.mapping.controlled import Controlled
 from overfly.mapping.settings import MapSettings
 from overfly.metrics.evaluate import evaluate
 
@@ -80,14 +82,29 @@ def test_heights_of_ground_control_go_through_the_geoid_if_their_crs_says_so(geo
     assert (sea.latitude, sea.longitude) == pytest.approx((flat.latitude, flat.longitude))
 
 
+@pytest.mark.parametrize(
+    ("crs", "expected"),
+    [
+        ("EPSG:32615+5773", (32615, 5773)),
+        ("EPSG:4326+5773", (32616, 5773)),
+        ("EPSG:32615", (32615, None)),
+        ("EPSG:4326", (32616, None)),
+    ],
+)
+def test_products_have_the_heights_of_the_controls_that_hold_them(crs: str, expected: tuple[int, int | None]) -> None:
+    held = Controlled(SimpleNamespace(), SimpleNamespace(), used=True, crs=control_crs(crs))  # type: ignore[arg-type]
+    origin = held.in_their_crs(replace(ELLIPSOIDAL, epsg=32616, vertical_epsg=3855))
+    assert (origin.epsg, origin.vertical_epsg) == expected
+    unused = replace(held, used=False)
+    assert unused.in_their_crs(ELLIPSOIDAL) == ELLIPSOIDAL
+
+
 def test_ground_control_above_the_sea_needs_the_grid() -> None:
     with pytest.raises(InputError, match="need the geoid grid us_nga_egm96_15"):
         control_origin(points("EPSG:32615+5773", 110.0))
 
 
 def test_controls_that_do_not_say_what_their_heights_refer_to_cannot_be_moved(geoid) -> None:  # type: ignore[no-untyped-def]
-    from types import SimpleNamespace
-
     from overfly.mapping.heights import heights_of, with_heights
 
     survey = SimpleNamespace(sigma_m=(0.1, 0.1))

@@ -153,9 +153,7 @@ def _held_block(
             result = placed_by_controls(flight, result, origin, warnings)
         if origin is not None:
             ruled = controlled(flight, result, origin, with_gps=at is not None, how=control, warnings=warnings)
-            result = ruled.adjusted
-            if ruled.used and ruled.crs[0] is not None:
-                origin = replace(origin, epsg=ruled.crs[0], vertical_epsg=ruled.crs[1])
+            result, origin = ruled.adjusted, ruled.in_their_crs(origin)
     metric = at is not None or (ruled is not None and ruled.used)
     if not metric:
         origin = None

@@ -38,9 +38,9 @@ def control_origin(points: Sequence[ControlPoint]) -> Origin | None:
 
 
 def control_crs(text: str) -> tuple[int | None, int | None]:
-    """EPSG codes of the projected CRS in metres and of the vertical CRS in metres of a control file's first line.
+    """EPSG codes of the projected CRS in metres and of the vertical CRS of a control file's first line.
 
-    None of both where there is none; heights then are taken as they are.
+    None where there is none; without a vertical one heights are taken as they are.
     """
     from pyproj import CRS
 

@@ -47,6 +47,15 @@ class Controlled:
     used: bool = False
     crs: tuple[int | None, int | None] = (None, None)
 
+    def in_their_crs(self, origin: Origin) -> Origin:
+        """The origin of a block, its products in the CRS of the controls that hold it; degrees are no CRS of products.
+
+        Heights are always those of the controls: over what theirs are, or over nothing known.
+        """
+        if not self.used:
+            return origin
+        return replace(origin, epsg=self.crs[0] or origin.epsg, vertical_epsg=self.crs[1])
+
 
 def placed_by_controls(flight: Flight, result: Adjusted, origin: Origin, warnings: list[str]) -> Adjusted:
     """A block without GPS moved onto its controls by a similarity; unchanged where they do not suffice."""
