@@ -62,6 +62,23 @@ def test_without_the_grid_or_a_place_it_is_refused_before_anything_is_computed(t
     assert MapSettings(dense="stereo", heights="ellipsoidal").heights == "ellipsoidal"
 
 
+def test_cameras_whose_origin_asks_for_heights_are_refused_without_the_grid(tmp_path: Path) -> None:
+    flight = make_flight(tmp_path / "flight", block={"altitude": 55.0, "origin": {**ORIGIN, "vertical_epsg": 5773}})
+    with pytest.raises(InputError, match="need the geoid grid"):
+        mapped(flight, tmp_path / "out")
+    assert not list((tmp_path / "out" / "work").glob("dense-*"))
+    assert mapped(flight, tmp_path / "out", heights="ellipsoidal")["crs"] == "EPSG:32615"
+
+
+def test_other_heights_reuse_the_steps_and_leave_nothing_of_the_ones_before(geoid, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    flight, out = make_flight(tmp_path / "flight", block={"altitude": 55.0, "origin": ORIGIN}), tmp_path / "out"
+    mapped(flight, out, ply=True)
+    sea = mapped(flight, out, heights="egm96")
+    assert (sea["reused"], sea["crs"]) == (["cameras", "dense"], "EPSG:32615+5773")
+    assert not (out / "cloud.ply").exists()
+    assert read_cloud(out / "cloud.laz").vertical_epsg == 5773
+
+
 def test_a_flight_without_a_place_on_the_earth_has_no_such_heights(geoid, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InputError, match="needs a place on the Earth"):
         mapped(make_flight(tmp_path / "flight"), tmp_path / "out", heights="egm96")

@@ -75,12 +75,13 @@ def deliver(
     turn = np.eye(4) if level else turn
     written = ["cloud.laz", *(["cloud.ply"] if asked.ply else [])]
     with steps.timed("products"):
+        # What an earlier map left may have other heights, and is not written each time.
+        for name in ("cloud.ply", "dsm.tif", "orthophoto.tif", "mesh.glb"):
+            (out / name).unlink(missing_ok=True)
         for name in written:
             write_clouds(placed, out / name, count=len(placed), low=placed.bounds.min((0, 1)))
         facts = {} if block.metric else {"scale": "unknown"}
         write_transforms(out / "transforms.json", block.frames, block.origin, facts)
-        for name in ("dsm.tif", "orthophoto.tif", "mesh.glb"):
-            (out / name).unlink(missing_ok=True)
         if level:
             views, gains = _rasters(placed, block, few_placed.epsg, out, gsd=gsd, window=window, sample=sample)
             written += ["dsm.tif", "orthophoto.tif"]

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from overfly.errors import InputError
-from overfly.geodesy import crs_from_enu, vertical_crs
+from overfly.geodesy import Origin, crs_from_enu, vertical_crs
 from overfly.mapping.block import Block
 
 
 def with_heights(block: Block, asked: str | None) -> Block:
-    """The block, its products in the vertical CRS asked for; unchanged where none is asked for.
+    """The block, its products in the vertical CRS asked for; where none is asked for, in that of its origin.
 
     Args:
         block: with cameras in metres on the Earth, if heights are asked for.
@@ -22,6 +22,8 @@ def with_heights(block: Block, asked: str | None) -> Block:
         InputError: the place on the Earth, or what the controls' heights refer to, is not known; no grid covers it.
     """
     if asked is None:
+        if block.origin is not None and block.metric:
+            _check_reach(block.origin)
         return block
     if block.origin is None or not block.metric:
         raise InputError(
@@ -34,8 +36,13 @@ def with_heights(block: Block, asked: str | None) -> Block:
             f"to: write EPSG:{block.origin.crs_epsg}+5773, or the right vertical CRS, into its first line."
         )
     origin = replace(block.origin, vertical_epsg=vertical_crs(asked))
-    crs_from_enu(np.zeros((1, 3)), origin)  # refuses a grid that does not reach here, before the long steps
+    _check_reach(origin)
     return replace(block, origin=origin)
+
+
+def _check_reach(origin: Origin) -> None:
+    """Refuse a grid that is missing or does not reach here, before the long steps."""
+    crs_from_enu(np.zeros((1, 3)), origin)
 
 
 def heights_of(block: Block) -> str | None:
