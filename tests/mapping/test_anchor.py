@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from overfly.mapping.anchor import anchored
 
@@ -57,6 +58,13 @@ def test_outliers_do_not_pull() -> None:
     measured = true.copy()
     measured[:, ::3] += 40.0  # a third of the matches are wrong
     assert np.abs(anchored(houses, measured) - true).mean() < 0.6
+
+
+@pytest.mark.parametrize("shape", [(4, 120), (6, 120), (120, 1), (1, 1)])
+def test_a_strip_of_one_or_two_cells_has_a_plate_too(shape: tuple[int, int]) -> None:
+    measured = np.full(shape, -50, np.float32)
+    measured[-shape[0] // 3 :, -shape[1] // 3 :] = np.nan if max(shape) > 1 else -50
+    np.testing.assert_allclose(anchored(np.full(shape, -40, np.float32), measured), -50, atol=1e-2)
 
 
 def test_without_measurements_the_suggestion_stands() -> None:

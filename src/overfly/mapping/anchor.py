@@ -81,12 +81,14 @@ def _cells(measured: Map, size: int) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 def _plate(medians: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """The thin plate [rows, columns] through weighted values, those that miss it weighed less (Huber's weights)."""
-    from scipy.sparse import diags_array, eye_array, kron
+    from scipy.sparse import csr_array, diags_array, eye_array, kron
     from scipy.sparse.linalg import spsolve
 
     def differences(n: int, order: int) -> Any:
+        if n <= order:  # a strip of a picture
+            return csr_array((0, n))
         pattern = {1: [-1.0, 1.0], 2: [1.0, -2.0, 1.0]}[order]
-        return diags_array(pattern, offsets=list(range(order + 1)), shape=(max(n - order, 0), n))
+        return diags_array(pattern, offsets=list(range(order + 1)), shape=(n - order, n))
 
     def squared(down: Any, along: Any) -> Any:
         both = kron(down, along)
