@@ -4,7 +4,7 @@
 
     sweep, stereo    ``overfly map --cameras estimate`` with every product
     pycolmap         pycolmap's defaults, then OpenCV's semi-global matcher (``truth/stock.py``), cloud only
-    pycolmap_held    the same, focal length held at EXIF's
+    pycolmap_held    the same, focal length held at EXIF's, no lens distortion
     ppg              pyarchinit-photogrammetry's command in an environment of its own, all defaults, cloud only
 
 Every cloud is laid upon the true surface by the best similarity of its measured points, since GPS leaves the whole
@@ -85,7 +85,7 @@ def local_cloud(case: Case, path: Path) -> Cloud:
     cloud, origin = read_cloud(path), case.flight.origin
     assert origin is not None
     if cloud.epsg is not None:
-        cloud = cloud.with_points(enu_from_crs(cloud.points, origin, cloud.epsg))
+        cloud = cloud.with_points(enu_from_crs(cloud.points, origin, cloud.epsg, cloud.vertical_epsg))
     # An alignment by heights lays a raster over all points: one that is 100 km away costs more than it tells.
     middle = np.median(cloud.points, axis=0)
     return cloud[np.linalg.norm(cloud.points - middle, axis=1) < 20 * case.altitude]

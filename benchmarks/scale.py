@@ -112,10 +112,8 @@ def main() -> None:
             rows.append({"width": asked.width, **mapped(flight, out, dense, asked.max_memory)})
             print(rows[-1], file=sys.stderr, flush=True)
     write_rows(asked.work / "scale.csv", rows)
-    shown = ("frames", "dense", "points", "core_seconds", "seconds", "dense_s", "fuse_s", "products_s", "peak_mb")
-    text = markdown(
-        [{k: f"{row[k]:.0f}" if k not in ("dense",) else row[k] for k in shown if k in row} for row in rows]
-    )
+    shown = ("frames", "dense", "points", "core_seconds", "seconds", "dense_s", "products_s", "peak_mb")
+    text = markdown([{k: f"{row[k]:.0f}" if k != "dense" else row[k] for k in shown if k in row} for row in rows])
     for dense in asked.dense:
         exponent = growth([row for row in rows if row["dense"] == dense])
         text += "" if exponent is None else f"\n{dense}: core-seconds grow as frames to the power {exponent:.2f}.\n"

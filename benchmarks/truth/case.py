@@ -123,7 +123,7 @@ class Case:
         if cloud.epsg is None:
             return cloud
         assert self.flight.origin is not None
-        return cloud.with_points(enu_from_crs(cloud.points, self.flight.origin, cloud.epsg))
+        return cloud.with_points(enu_from_crs(cloud.points, self.flight.origin, cloud.epsg, cloud.vertical_epsg))
 
 
 def measure(case: Case, cloud: Cloud) -> dict[str, Any]:
