@@ -109,7 +109,7 @@ def test_a_missing_geoid_grid_is_named_and_never_passed_over() -> None:
         geodesy.vertical_crs("EPSG:5701")
 
 
-@pytest.mark.parametrize("text", ["sea", "EPSG:4326", "32632", "6360", ""])
+@pytest.mark.parametrize("text", ["sea", "EPSG:4326", "32632", "6360", "5715", ""])
 def test_what_is_no_vertical_crs_in_metres_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="are not known: give ellipsoidal, egm96, egm2008, or the EPSG code"):
         geodesy.vertical_crs(text)

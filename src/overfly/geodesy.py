@@ -152,7 +152,7 @@ def vertical_crs(text: str) -> int | None:
     """The EPSG code of a vertical CRS by its name: ellipsoidal (None), egm96, egm2008, or a code such as EPSG:5703.
 
     Raises:
-        InputError: it is no vertical CRS in metres, or PROJ lacks the grid that it needs.
+        InputError: it is no vertical CRS in metres upwards, or PROJ lacks the grid that it needs.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -165,7 +165,11 @@ def vertical_crs(text: str) -> int | None:
         crs = CRS.from_epsg(int(code))
     except (ValueError, CRSError):
         crs = None
-    if crs is None or not crs.is_vertical or crs.axis_info[0].unit_name != "metre":
+    if (
+        crs is None
+        or not crs.is_vertical
+        or (crs.axis_info[0].unit_name, crs.axis_info[0].direction) != ("metre", "up")
+    ):
         raise InputError(
             f"The heights {text!r} are not known: give ellipsoidal, {', '.join(VERTICAL)}, or the EPSG code of a "
             "vertical CRS in metres, such as EPSG:5773."
