@@ -11,11 +11,13 @@ import pytest
 import rasterio
 from test_map import GROUND, ORIGIN, make_flight, mapped
 
+from conftest import bar
 from overfly.cloud import read_cloud
 from overfly.errors import InputError
-from overfly.flights import ControlPoint
+from overfly.flights import ControlPoint, read_flight
 from overfly.geodesy import Origin, crs_from_enu
-from overfly.mapping.control import control_crs, control_origin
+from overfly.mapping.align import align
+from overfly.mapping.control import control_crs, control_origin, control_places
 from overfly.mapping.controlled import Controlled
 from overfly.mapping.settings import MapSettings
 from overfly.metrics.evaluate import evaluate
@@ -116,9 +118,20 @@ def test_products_have_the_heights_of_the_controls_that_hold_them(crs: str, expe
     assert unused.in_their_crs(ELLIPSOIDAL) == ELLIPSOIDAL
 
 
-def test_ground_control_above_the_sea_needs_the_grid() -> None:
+def test_ground_control_above_the_sea_needs_the_grid_before_the_long_steps(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="need the geoid grid us_nga_egm96_15"):
         control_origin(points("EPSG:32615+5773", 110.0))
+    flight = replace(read_flight(make_flight(tmp_path / "flight")), gcps=points("EPSG:32615+5773", 110.0))
+    with pytest.raises(InputError, match="need the geoid grid us_nga_egm96_15"):
+        align(flight, workdir=tmp_path / "work", seed=0, bar=bar)
+    assert not (tmp_path / "work").exists()
+
+
+def test_the_way_through_the_geoid_is_found_once_for_all_controls(geoid, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+    asked: list[str] = []
+    monkeypatch.setattr("overfly.mapping.control.vertical_crs", asked.append)
+    control_places(points("EPSG:32615+5773", 110.0))
+    assert asked == ["5773"]
 
 
 def test_controls_that_do_not_say_what_their_heights_refer_to_cannot_be_moved(geoid) -> None:  # type: ignore[no-untyped-def]

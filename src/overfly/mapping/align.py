@@ -16,7 +16,7 @@ from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
 from overfly.mapping.bundle import Bundle, bundle_of
 from overfly.mapping.calibration import FOCAL_SUSPECT, adjusted_twice, calibrated, focal_drift, held_by_images
-from overfly.mapping.control import control_origin
+from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, strongest_pair
 from overfly.mapping.georeference import by_ground
@@ -57,7 +57,7 @@ def align(
         levelled frame whose cameras stand 100 units above the ground and ``metric`` is False.
 
     Raises:
-        InputError: fewer than two images could be placed.
+        InputError: fewer than two images could be placed, or the CRS of the controls cannot be used.
     """
     import pycolmap
 
@@ -65,6 +65,8 @@ def align(
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     if len(flight.frames) < 2:
         raise InputError(f"Cameras cannot be estimated from {len(flight.frames)} image: give two or more that overlap.")
+    if control != "none":
+        control_places(flight.gcps)  # refuses a CRS that does not fit, or lacks its grid, before the long steps
     workdir.mkdir(parents=True, exist_ok=True)
     warnings: list[str] = []
     origin, told = gps_frame(flight)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from overfly.geodesy import Origin, enu_from_geodetic, epsg_codes, vertical_crs
 from overfly.geometry import Array, fit_similarity, transform
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.clicks import Control
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
 
 FEWEST = 3
 FEWEST_TO_CHECK = 4
@@ -32,8 +36,7 @@ def control_origin(points: Sequence[ControlPoint]) -> Origin | None:
     """An origin in the middle of the controls, in their own CRS; None if there are less than three."""
     if len(points) < FEWEST:
         return None
-    geodetic = np.array([_geodetic(point) for point in points])
-    latitude, longitude, height = (float(v) for v in np.median(geodetic, axis=0))
+    latitude, longitude, height = (float(v) for v in np.median(control_places(points), axis=0))
     return Origin(latitude, longitude, height, *control_crs(points[0].crs))
 
 
@@ -52,29 +55,47 @@ def control_crs(text: str) -> tuple[int | None, int | None]:
     return horizontal if metres else None, vertical
 
 
-def _geodetic(point: ControlPoint) -> tuple[float, float, float]:
+def control_places(points: Sequence[ControlPoint]) -> Array:
+    """Latitude, longitude and height [N, 3] of control points; heights over the ellipsoid where their CRS tells that.
+
+    Raises:
+        InputError: the CRS does not fit the coordinates, or PROJ lacks the grid of its vertical part.
+    """
+    # Finding the way through a vertical CRS takes PROJ a second or two: once for all points of a file.
+    ways = {crs: _way(crs) for crs in {point.crs for point in points}}
+    return np.array([_place(point, *ways[point.crs]) for point in points]).reshape(-1, 3)
+
+
+def _way(text: str) -> tuple[Transformer, int | None]:
+    """From a control file's CRS to longitude and latitude, and height where it has a vertical CRS; its code."""
     from pyproj import CRS, Transformer
     from pyproj.exceptions import ProjError
 
     from overfly.flights.odm import crs_name
 
+    try:
+        crs = CRS.from_user_input(crs_name(text))
+        if not crs.is_compound:
+            return Transformer.from_crs(crs, "EPSG:4326", always_xy=True), None
+        vertical = epsg_codes(crs)[1]
+        vertical_crs(str(vertical))  # says which grid is missing
+        return Transformer.from_crs(crs, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True), vertical
+    except ProjError as error:
+        raise _unfit(text, error) from error
+
+
+def _place(point: ControlPoint, way: Transformer, vertical: int | None) -> tuple[float, float, float]:
+    from pyproj.exceptions import ProjError
+
     x, y, z = point.position
     try:
-        crs = CRS.from_user_input(crs_name(point.crs))
-        if not crs.is_compound:
-            place = Transformer.from_crs(crs, "EPSG:4326", always_xy=True).transform(x, y, errcheck=True)
-            return place[1], place[0], z
-    except ProjError as error:
-        raise InputError(
-            f"The first line of gcp_list.txt must be a CRS that fits the coordinates, such as EPSG:32617, not "
-            f"{point.crs!r} ({str(error).splitlines()[0]})."
-        ) from error
-    vertical = epsg_codes(crs)[1]
-    vertical_crs(str(vertical))  # says which grid is missing
-    try:
-        way = Transformer.from_crs(crs, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True)
+        if vertical is None:
+            longitude, latitude = way.transform(x, y, errcheck=True)
+            return latitude, longitude, z
         longitude, latitude, height = way.transform(x, y, z, errcheck=True)
     except ProjError as error:
+        if vertical is None:
+            raise _unfit(point.crs, error) from error
         raise InputError(
             f"The height of {point.name} in gcp_list.txt cannot be taken from EPSG:{vertical} to the ellipsoid "
             f"({str(error).splitlines()[0]}): check its coordinates and the CRS."
@@ -82,8 +103,15 @@ def _geodetic(point: ControlPoint) -> tuple[float, float, float]:
     return latitude, longitude, height
 
 
+def _unfit(crs: str, error: Exception) -> InputError:
+    return InputError(
+        f"The first line of gcp_list.txt must be a CRS that fits the coordinates, such as EPSG:32617, not "
+        f"{crs!r} ({str(error).splitlines()[0]})."
+    )
+
+
 def read_controls(flight: Flight, bundle: Bundle, origin: Origin, warnings: list[str]) -> list[Control]:
-    """The flight's control points with their clicks in the bundle's images; heights are taken as the file has them.
+    """The flight's control points with their clicks in the bundle's images; for heights see :func:`control_places`.
 
     Clicks outside of their image or in images that the flight does not have are left out, with one warning each kind.
     """
@@ -91,7 +119,7 @@ def read_controls(flight: Flight, bundle: Bundle, origin: Origin, warnings: list
     by_base = {name.rsplit("/", 1)[-1].lower(): i for name, i in by_name.items()}
     image_of = {int(frame): k for k, frame in enumerate(bundle.frames)}
     absent, outside, found = set(), set(), []
-    for point in flight.gcps:
+    for point, place in zip(flight.gcps, enu_from_geodetic(control_places(flight.gcps), origin), strict=True):
         clicks = []
         for name, (u, v) in point.pixels.items():
             number = by_name.get(name, by_base.get(name.rsplit("/", 1)[-1].lower()))
@@ -103,7 +131,7 @@ def read_controls(flight: Flight, bundle: Bundle, origin: Origin, warnings: list
                 outside.add(f"{point.name} in {name}")
             elif number in image_of:
                 clicks.append((image_of[number], (u, v)))
-        found.append(Control(point.name, enu_from_geodetic([_geodetic(point)], origin)[0], tuple(sorted(clicks))))
+        found.append(Control(point.name, place, tuple(sorted(clicks))))
     if absent:
         warnings.append(
             f"gcp_list.txt names {len(absent)} images that the flight does not have ({_listed(absent)}): these lines "
