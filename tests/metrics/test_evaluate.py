@@ -100,6 +100,23 @@ def test_frames() -> None:
     assert "by shift" in laid["warnings"][0]
 
 
+def test_heights_that_refer_to_different_things_are_told_refused_or_laid_upon_each_other() -> None:
+    plain, sea, other = (
+        Cloud(surface(3000) + UTM, epsg=32615, vertical_epsg=vertical) for vertical in (None, 5773, 3855)
+    )
+    same = evaluate(sea, sea)
+    assert (same["epsg"], same["vertical_epsg"], same["warnings"]) == (32615, 5773, [])
+    for cloud, reference in ((plain, sea), (sea, plain)):
+        assert "heights over ellipsoid and sea differ" in evaluate(cloud, reference)["warnings"][0]
+    with pytest.raises(InputError, match=r"in EPSG:32615\+5773, the reference in EPSG:32615\+3855: reproject"):
+        evaluate(sea, other)
+    for cloud, reference in ((plain, sea), (sea, plain), (sea, other)):
+        assert "laid upon each other by shift" in evaluate(cloud, reference, align="shift")["warnings"][0]
+    with pytest.raises(InputError, match=r"EPSG:32616, the reference in EPSG:32615\+5773"):
+        evaluate(Cloud(plain.points, epsg=32616), sea, align="shift")
+    assert "in that of the reference, EPSG:32615+5773" in evaluate(Cloud(sea.points), sea)["warnings"][0]
+
+
 def test_the_reference_of_a_flight_folder_is_brought_to_the_crs_of_its_map(tmp_path: Path) -> None:
     origin = Origin(46.0, 8.0, 450.0, 32632)
     local = np.random.default_rng(0).uniform(0, 30, (500, 3))
