@@ -30,7 +30,7 @@ STEP = 3.0
 
 
 def placing(origin: Origin | None) -> Place:
-    """From ``origin``'s projected CRS to its local frame; the identity where there is none."""
+    """From ``origin``'s projected and vertical CRS to its local frame; the identity where there is none."""
     return (lambda points: points) if origin is None else (lambda points: enu_from_crs(points, origin))
 
 

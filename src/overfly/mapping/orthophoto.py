@@ -50,7 +50,8 @@ class Orthophoto:
         frames: with cameras and poses in the block's frame, z up. All images are read once here, for the gains.
         overview: grid of the whole surface, coarse: an eighth of the surface model's resolution is plenty.
         heights: [rows, columns] of the overview, NaN where empty.
-        origin: given, grids and heights are in its projected CRS (``origin.crs_epsg``); None, in the block's frame.
+        origin: given, grids are in its projected CRS (``origin.crs_epsg``) and heights in its vertical one, if it has
+            one; None, in the block's frame.
         image_mb: megabytes of decoded images that are kept from window to window.
 
     Attributes:

@@ -42,7 +42,8 @@ class MapSettings:
         resume: reuse finished steps of an earlier map of the same images with the same settings.
         overwrite: replace another flight's map in the same folder.
         heights: vertical CRS of the products by name or code (:func:`overfly.geodesy.vertical_crs`); None: that of
-            gcp_list.txt, else heights above the ellipsoid.
+            gcp_list.txt if it holds the map, or of the origin that comes with given cameras, else heights above the
+            ellipsoid.
         ply: write ``cloud.ply`` too.
         mesh: write the textured mesh ``mesh.glb`` too; one that an earlier map left is removed.
         mesh_faces: about so many triangles; None: :data:`MESH_FACES`. Only with ``mesh``.
