@@ -100,7 +100,7 @@ def test_heights_above_the_sea_are_lower_by_the_geoid(geoid, place: tuple[float,
     assert_allclose(geodesy.enu_from_crs(above_ellipsoid, origin, origin.crs_epsg), points, atol=1e-5)
 
 
-def test_a_missing_geoid_grid_is_named_and_never_passed_over() -> None:
+def test_a_missing_geoid_grid_is_named_and_never_passed_over(no_geoid: None) -> None:
     with pytest.raises(InputError, match=r"us_nga_egm96_15\.tif, which is not on this machine: copy it from"):
         geodesy.vertical_crs("egm96")
     with pytest.raises(InputError, match=r"need the geoid grid us_nga_egm96_15\.tif"):

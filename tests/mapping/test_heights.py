@@ -58,13 +58,13 @@ def test_products_above_the_sea(geoid, tmp_path: Path) -> None:  # type: ignore[
     assert found["accuracy_median_m"] == pytest.approx(geoid(-91.99), abs=0.05)
 
 
-def test_without_the_grid_or_a_place_it_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
+def test_without_the_grid_or_a_place_it_is_refused_before_anything_is_computed(no_geoid: None, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="need the geoid grid"):
         MapSettings(dense="stereo", heights="egm96")
     assert MapSettings(dense="stereo", heights="ellipsoidal").heights == "ellipsoidal"
 
 
-def test_cameras_whose_origin_asks_for_heights_are_refused_without_the_grid(tmp_path: Path) -> None:
+def test_cameras_whose_origin_asks_for_heights_are_refused_without_the_grid(no_geoid: None, tmp_path: Path) -> None:
     flight = make_flight(tmp_path / "flight", block={"altitude": 55.0, "origin": {**ORIGIN, "vertical_epsg": 5773}})
     with pytest.raises(InputError, match="need the geoid grid"):
         mapped(flight, tmp_path / "out")
@@ -118,7 +118,7 @@ def test_products_have_the_heights_of_the_controls_that_hold_them(crs: str, expe
     assert unused.in_their_crs(ELLIPSOIDAL) == ELLIPSOIDAL
 
 
-def test_ground_control_above_the_sea_needs_the_grid_before_the_long_steps(tmp_path: Path) -> None:
+def test_ground_control_above_the_sea_needs_the_grid_before_the_long_steps(no_geoid: None, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="need the geoid grid us_nga_egm96_15"):
         control_origin(points("EPSG:32615+5773", 110.0))
     flight = replace(read_flight(make_flight(tmp_path / "flight")), gcps=points("EPSG:32615+5773", 110.0))
