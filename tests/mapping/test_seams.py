@@ -46,6 +46,19 @@ def test_vertices_without_a_photograph_are_not_moved() -> None:
     np.testing.assert_array_equal(movements(colors, vertex, faces), 0)
 
 
+def test_charts_that_meet_where_one_has_no_photograph_agree() -> None:
+    n = 60
+    vertex, faces, away = two_charts(n)
+    colors = np.repeat([[4.6, 4.5, 4.4], [4.72, 4.5, 4.36]], n * n, axis=0)
+    seam = vertex[: n * n][away[: n * n] == 0]
+    between = n * n  # a chart of the cloud's colours, numbered between the two, has a vertex at each of their joints
+    vertex, colors = np.insert(vertex, between, seam), np.insert(colors, between, np.full((n, 3), np.nan), axis=0)
+    faces = faces + n * (faces >= between)
+    moved = movements(colors, vertex, faces)
+    left, right = moved[: n * n][away[: n * n] == 0], moved[n * n + n :][away[n * n :] == 0]
+    np.testing.assert_allclose(left - right, np.tile([0.12, 0, -0.04], (n, 1)), atol=0.02)
+
+
 def test_the_field_is_linear_between_vertices_and_continued_a_little() -> None:
     pixels = np.array([[40.0, 20], [200, 20], [200, 140], [40, 140]])
     moved = np.column_stack([pixels[:, 0] / 10, pixels[:, 1] / 10, np.full(4, -3.0)])

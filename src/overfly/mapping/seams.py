@@ -48,9 +48,10 @@ def movements(tones: Array, vertex: NDArray, faces: NDArray) -> Array:
     from scipy.sparse.linalg import cg
 
     known = np.asarray(np.isfinite(tones).all(1))
-    order = np.argsort(vertex, kind="stable")
+    order = np.flatnonzero(known)  # what is not compared must not stand between two that are
+    order = order[np.argsort(vertex[order], kind="stable")]
     i, j = order[:-1], order[1:]
-    joint = (vertex[i] == vertex[j]) & known[i] & known[j]
+    joint = vertex[i] == vertex[j]
     i, j = i[joint], j[joint]
     off = tones[j] - tones[i]
     weight = JOINT * np.maximum(0, 1 - (off**2).mean(1) / UNLIKE**2) ** 2  # Tukey's
