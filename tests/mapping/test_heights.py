@@ -19,6 +19,7 @@ from overfly.geodesy import Origin, crs_from_enu
 from overfly.mapping.align import align
 from overfly.mapping.control import control_crs, control_origin, control_places
 from overfly.mapping.controlled import Controlled
+from overfly.mapping.map import align_flight
 from overfly.mapping.settings import MapSettings
 from overfly.metrics.evaluate import evaluate
 
@@ -69,6 +70,7 @@ def test_cameras_whose_origin_asks_for_heights_are_refused_without_the_grid(no_g
     with pytest.raises(InputError, match="need the geoid grid"):
         mapped(flight, tmp_path / "out")
     assert not list((tmp_path / "out" / "work").glob("dense-*"))
+    align_flight(flight, out=tmp_path / "out", dense="stereo", progress=False)  # without products none is needed
     assert mapped(flight, tmp_path / "out", heights="ellipsoidal")["crs"] == "EPSG:32615"
 
 

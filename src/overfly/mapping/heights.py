@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from overfly.errors import InputError
-from overfly.geodesy import Origin, crs_from_enu, vertical_crs
+from overfly.geodesy import crs_from_enu, vertical_crs
 from overfly.mapping.block import Block
 
 
@@ -19,11 +19,9 @@ def with_heights(block: Block, asked: str | None) -> Block:
         asked: see :func:`overfly.geodesy.vertical_crs`.
 
     Raises:
-        InputError: the place on the Earth, or what the controls' heights refer to, is not known; no grid covers it.
+        InputError: the place on the Earth, or what the controls' heights refer to, is not known.
     """
     if asked is None:
-        if block.origin is not None and block.metric:
-            _check_reach(block.origin)
         return block
     if block.origin is None or not block.metric:
         raise InputError(
@@ -35,14 +33,17 @@ def with_heights(block: Block, asked: str | None) -> Block:
             f"--heights {asked} cannot be reached from the heights of gcp_list.txt, which do not say what they refer "
             f"to: write EPSG:{block.origin.crs_epsg}+5773, or the right vertical CRS, into its first line."
         )
-    origin = replace(block.origin, vertical_epsg=vertical_crs(asked))
-    _check_reach(origin)
-    return replace(block, origin=origin)
+    return replace(block, origin=replace(block.origin, vertical_epsg=vertical_crs(asked)))
 
 
-def _check_reach(origin: Origin) -> None:
-    """Refuse a grid that is missing or does not reach here, before the long steps."""
-    crs_from_enu(np.zeros((1, 3)), origin)
+def check_heights(block: Block) -> None:
+    """Refuse heights of products that cannot be told, before the long steps.
+
+    Raises:
+        InputError: the grid of the vertical CRS is missing, or does not reach this place.
+    """
+    if block.origin is not None and block.metric:
+        crs_from_enu(np.zeros((1, 3)), block.origin)
 
 
 def heights_of(block: Block) -> str | None:

@@ -17,7 +17,7 @@ from overfly.flights import Flight, read_flight
 from overfly.geodesy import crs_code
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
-from overfly.mapping.heights import with_heights
+from overfly.mapping.heights import check_heights, with_heights
 from overfly.mapping.needs import Budget, allowed_gb, budget, least_gb
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import SIZE, MapSettings
@@ -45,7 +45,9 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
     """
     flight, steps, identity, asked = _opened(flight_folder, out, settings)
     with _told_when_stopped(steps):
-        block, local = _measured(flight, identity, asked, steps)
+        block, key = _aligned(flight, identity, asked, steps)
+        check_heights(block)
+        local = _measured(flight, block, key, asked, steps)
         held = memory_budget(block, asked)
         return deliver(flight, block, local, Path(out), asked, steps, window=held.window, sample=held.sample)
 
@@ -61,7 +63,8 @@ def measure_flight(flight_folder: Path | str, *, out: Path | str, **settings: An
     """The flight, its cameras and the dense cloud in their frame, without products; arguments as :func:`map_flight`."""
     flight, steps, identity, asked = _opened(flight_folder, out, settings)
     with _told_when_stopped(steps):
-        return flight, *_measured(flight, identity, asked, steps)
+        block, key = _aligned(flight, identity, asked, steps)
+        return flight, block, _measured(flight, block, key, asked, steps)
 
 
 def _opened(
@@ -118,8 +121,8 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
     return block, key
 
 
-def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, Tiles]:
-    block, key = _aligned(flight, identity, asked, steps)
+def _measured(flight: Flight, block: Block, key: str, asked: MapSettings, steps: Steps) -> Tiles:
+    """The dense cloud of a block, whose own key is given."""
     check_memory(block, asked)
     network = _network_key(asked) if asked.dense == "sweep" else None
     key = key_of(key, DENSE_FORM, asked.dense, network, asked.seed, *([] if asked.size == SIZE else [asked.size]))
@@ -129,7 +132,7 @@ def _measured(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -
     }[asked.dense]
     local = steps.kept("dense", key, make, keep_tiles, kept_tiles)
     steps.say("dense", f"{count_text(len(local))} points by {_how(asked)}")
-    return block, local
+    return local
 
 
 def check_memory(block: Block, asked: MapSettings) -> None:
