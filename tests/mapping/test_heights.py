@@ -59,7 +59,7 @@ def test_products_above_the_sea(geoid, tmp_path: Path) -> None:  # type: ignore[
     assert found["accuracy_median_m"] == pytest.approx(geoid(-91.99), abs=0.05)
 
 
-def test_without_the_grid_or_a_place_it_is_refused_before_anything_is_computed(no_geoid: None, tmp_path: Path) -> None:
+def test_without_the_grid_it_is_refused_before_anything_is_computed(no_geoid: None, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="need the geoid grid"):
         MapSettings(dense="stereo", heights="egm96")
     assert MapSettings(dense="stereo", heights="ellipsoidal").heights == "ellipsoidal"
@@ -83,9 +83,16 @@ def test_other_heights_reuse_the_steps_and_leave_nothing_of_the_ones_before(geoi
     assert read_cloud(out / "cloud.laz").vertical_epsg == 5773
 
 
-def test_a_flight_without_a_place_on_the_earth_has_no_such_heights(geoid, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(InputError, match="needs a place on the Earth"):
-        mapped(make_flight(tmp_path / "flight"), tmp_path / "out", heights="egm96")
+@pytest.mark.parametrize(
+    ("cameras", "advice"),
+    [("given", "cameras of transforms.json do not tell: give the origin"), ("estimate", "does not tell: give GPS in")],
+)
+def test_a_flight_without_a_place_on_the_earth_has_no_such_heights(  # type: ignore[no-untyped-def]
+    geoid, cameras: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("overfly.mapping.map.estimated_block", lambda *_: pytest.fail("the long step began"))
+    with pytest.raises(InputError, match=f"needs a place on the Earth, which .*{advice}"):
+        mapped(make_flight(tmp_path / "flight"), tmp_path / "out", heights="egm96", cameras=cameras)
 
 
 def points(crs: str, height: float) -> list[ControlPoint]:

@@ -7,8 +7,35 @@ from dataclasses import replace
 import numpy as np
 
 from overfly.errors import InputError
+from overfly.flights import Flight
 from overfly.geodesy import crs_from_enu, vertical_crs
 from overfly.mapping.block import Block
+
+
+def check_place(flight: Flight, asked: str | None, *, estimate: bool, control: str) -> None:
+    """Refuse heights that a flight cannot have, before its cameras are estimated.
+
+    Args:
+        flight: as it was read.
+        asked: as in :func:`with_heights`.
+        estimate: whether its cameras are estimated, not given.
+        control: what its ground control does, see :func:`overfly.mapping.align.align`.
+
+    Raises:
+        InputError: nothing tells its place on the Earth.
+    """
+    if asked is None or (not estimate and (flight.cameras_from is None or flight.origin is not None)):
+        return
+    if not estimate:
+        raise InputError(
+            f"--heights {asked} needs a place on the Earth, which the cameras of {flight.cameras_from} do not tell: "
+            "give the origin in transforms.json (key overfly.origin), map with --cameras estimate, or leave it out."
+        )
+    if sum(frame.gps is not None for frame in flight.frames) < 2 and (not flight.gcps or control == "none"):
+        raise InputError(
+            f"--heights {asked} needs a place on the Earth, which this flight does not tell: give GPS in the images, a "
+            "geo.txt or ground control, or leave it out."
+        )
 
 
 def with_heights(block: Block, asked: str | None) -> Block:
@@ -25,8 +52,8 @@ def with_heights(block: Block, asked: str | None) -> Block:
         return block
     if block.origin is None or not block.metric:
         raise InputError(
-            f"--heights {asked} needs a place on the Earth, which this flight does not tell: give GPS in the images or "
-            "a geo.txt, or leave it out."
+            f"--heights {asked} needs a place on the Earth, which could not be found: see the warnings about GPS and "
+            "ground control of a map without it."
         )
     if _held_by_controls(block) and block.origin.vertical_epsg is None:
         raise InputError(

@@ -17,7 +17,7 @@ from overfly.flights import Flight, read_flight
 from overfly.geodesy import crs_code
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
-from overfly.mapping.heights import check_heights, with_heights
+from overfly.mapping.heights import check_heights, check_place, with_heights
 from overfly.mapping.needs import Budget, allowed_gb, budget, least_gb
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import SIZE, MapSettings
@@ -105,6 +105,7 @@ def _told_when_stopped(steps: Steps) -> Iterator[None]:
 def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) -> tuple[Block, str]:
     """The block and the key of everything it depends on."""
     estimate = asked.cameras == "estimate" or (asked.cameras == "auto" and flight.cameras_from is None)
+    check_place(flight, asked.heights, estimate=estimate, control=asked.control)
     steps.say("images", _about(flight))
     ruled = [asked.control] if flight.gcps and asked.control != "split" else []
     matched = [asked.seed, *ruled, *([] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)])]
