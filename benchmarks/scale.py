@@ -25,6 +25,8 @@ import numpy as np
 from truth.cost import run_measured
 
 from overfly.flights import find_preset, fly
+from overfly.flights.plan import plan_flight
+from overfly.geometry import Camera
 from overfly.scenes import make_scene
 from overfly.tables import markdown, write_rows
 
@@ -32,14 +34,24 @@ ALTITUDE, OVERLAP, SIDE, SEED = 100.0, 75.0, 60.0, 901
 GIB = 2**30
 
 
+def side_of(frames: int, camera: Camera) -> float:
+    """Side in metres of the smallest square on which the flight has so many frames."""
+    side = 10.0
+    while True:
+        plan = plan_flight(
+            "grid", (0, 0, side, side), altitude=ALTITUDE, overlap=OVERLAP, side_overlap=SIDE, camera=camera,
+            ground=lambda xy: np.zeros(len(xy)), rng=np.random.default_rng(0),
+        )  # fmt: skip
+        if len(plan.world_from_camera) >= frames:
+            return side
+        side *= 1.02
+
+
 def flight_of(frames: int, width: int, work: Path, processes: int) -> Path:
-    """The flight folder of about so many frames, rendered if it is not there or not whole."""
+    """The flight folder of so many frames, rendered if it is not there or not whole."""
     folder = work / f"flight-{frames}-{width}"
     if not (folder / "transforms.json").is_file():
-        camera = find_preset("p4p").camera(width, width * 3 // 4)
-        ground = ALTITUDE / camera.fx
-        a_frame = camera.width * ground * (1 - SIDE / 100) * camera.height * ground * (1 - OVERLAP / 100)
-        side = math.sqrt(frames * a_frame)
+        side = side_of(frames, find_preset("p4p").camera(width, width * 3 // 4))
         fly(make_scene("suburb", SEED, size_m=math.ceil(side + 2 * ALTITUDE)), out=folder, altitude=ALTITUDE,
             overlap=OVERLAP, side_overlap=SIDE, width=width, height=width * 3 // 4, frames=frames, area_m=side,
             seed=SEED, supersample=1, processes=processes)  # fmt: skip

@@ -24,5 +24,5 @@ def unknown(what: str, given: object, allowed: Iterable[object], fix: str = "") 
     """An :class:`InputError` for a name that does not exist, with the nearest one that does."""
     names = sorted(str(name) for name in allowed)
     near = get_close_matches(str(given), names, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = f"; did you mean {near[0]!r}?" if near else "."
     return InputError(f"{what} {given!r} is unknown{hint} Allowed: {', '.join(names)}.{' ' + fix if fix else ''}")

@@ -241,3 +241,9 @@ def test_real_flights_register_completely(shared_data, name, count, focal, tmp_p
     assert len(block.frames) == count
     assert block.cameras[0].fx == pytest.approx(focal, rel=0.02)
     shutil.rmtree(tmp_path)
+
+
+def test_two_positions_near_each_other_do_not_tell_the_scale_and_that_is_said(strip_flight, kept) -> None:  # type: ignore[no-untyped-def]
+    frames = [replace(f, gps=f.gps if i in (0, 1) else None) for i, f in enumerate(strip_flight.frames)]
+    block = align(replace(strip_flight, frames=frames), workdir=kept, seed=0, bar=bar)
+    assert any("The scale is known to about" in words and "2 GPS positions within" in words for words in block.warnings)

@@ -29,7 +29,7 @@ def summary(**changes: Any) -> dict[str, Any]:
     base: dict[str, Any] = {
         "images": 18, "registered": 18, "points": 1_234_567, "measured": 1_234_567, "predicted": 0, "gsd_m": 0.0183,
         "crs": "EPSG:32615", "cameras_from": "estimated", "seconds": {"cameras": 61.0, "dense": 130.5},
-        "heights": "ellipsoid",
+        "heights": "EPSG:5773",
         "metric": True, "peak_memory_mb": 2048.0, "warnings": [], "area": 12_345.0, "points_per_area": 100.0,
         "height_range": [1.0, 9.0], "median_sigma": 0.03, "seen_once_share": 0.0, "reprojection_px": 0.61,
         "unregistered": [], "skipped": {}, "gps_rms": {"horizontal_m": 0.4, "vertical_m": 0.2}, "reused": ["cameras"],
@@ -109,12 +109,15 @@ def test_every_caution_has_its_cause() -> None:
         "disagree with the images by 9.0 m": {"gps_rms": {"horizontal_m": 9.0, "vertical_m": None}},
         "no place on the Earth": {"crs": None, "cameras_from": "transforms.json"},
         "reprojection error is 2.1 px": {"reprojection_px": 2.1},
+        "no geoid is applied": {"heights": "ellipsoid", "settings": {"heights": None}},
     }
     for words, change in cases.items():
         found = cautions(summary(**change), altitudes={}, has_gps=True)
         assert len(found) == 1, (words, found)
         assert words in found[0].what
         assert found[0].advice
+    meant = summary(heights="ellipsoid", settings={"heights": "ellipsoidal"})
+    assert cautions(meant, altitudes={}, has_gps=True) == []
     wrong = cautions(summary(), altitudes={"a": (120.0, 60.0), "b": (118.0, 60.0), "c": (None, 60.0)}, has_gps=True)
     assert "119 m above the mapped ground" in wrong[0].what
     assert str(cautions(summary(), altitudes={}, has_gps=True, from_readers=["one thing"])[0]).strip() == "one thing"

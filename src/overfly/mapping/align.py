@@ -26,6 +26,12 @@ from overfly.mapping.placing import UNKNOWN_M, placed
 from overfly.mapping.survey import Precision
 from overfly.networks.encoder import Encoder
 
+FEWEST_TO_JUDGE, UNJUDGED_M = 4, 1.5
+"""GPS positions from which on their misfit tells what they are worth, and what is taken of fewer, metres."""
+
+SCALE_UNSURE = 0.04
+"""Standard deviation of the scale by GPS, as a share, from which on it is told."""
+
 FOCAL_DRIFT = 0.1
 """Share by which a focal length may differ from the photos' data before this is said."""
 
@@ -136,6 +142,7 @@ def _held_block(
     if at is not None:
         result = adjusted_twice(at.bundle, replace(held_by_images(at.bundle, flight.frames), ups=at.ups,
                                 places=at.places, place_sigmas=at.sigmas, lever=True), flight.frames)  # fmt: skip
+        _remark_scale(at.places[:, :2], at.sigmas[:, :2], warnings)
         apart = [flight.frames[i].name for i in at.apart]
         if apart:
             warnings.append(
@@ -170,6 +177,22 @@ def _held_block(
         )
     _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
     return _block(result, flight.frames, origin, metric, ruled, at is not None, apart, warnings)
+
+
+def _remark_scale(places: Array, sigmas: Array, warnings: list[str]) -> None:
+    """Say how well positions [n, 2] with standard deviations [n, 2] tell the scale, where they tell it badly."""
+    known = np.isfinite(places).all(1)
+    spread = float(np.sqrt(((places[known] - places[known].mean(0)) ** 2).sum()))
+    sigma = float(np.median(sigmas[known]))
+    if known.sum() < FEWEST_TO_JUDGE:  # their misfit shows nothing of what they are worth
+        sigma = max(sigma, UNJUDGED_M)
+    share = sigma / max(spread, 1e-9)
+    if share > SCALE_UNSURE:
+        warnings.append(
+            f"The scale is known to about {100 * share:.0f} % only: {known.sum()} GPS positions within "
+            f"{np.ptp(places[known], axis=0).max():.0f} m tell it, each good to {sigma:.1f} m. Lengths "
+            "and heights are wrong by as much: fly over more ground, or use ground control."
+        )
 
 
 def _remark_focal(bundle: Bundle, frames: list[Frame], warnings: list[str]) -> None:

@@ -28,6 +28,9 @@ FOCAL_SUSPECT = 0.03
 FOCAL_SIGMA = 0.02
 """Standard deviation of a focal length by the photo's own data, as a share."""
 
+FEWEST_TO_FREE = 8
+"""Images of a camera from which on its focal length may be another than the photos' data tell: two lines of four."""
+
 GAIN = 0.01
 """Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
 
@@ -93,7 +96,7 @@ def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
     lens = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
     if result.cost - lens.cost > GAIN * lens.cost:
         result = lens
-    if drifted:
+    if drifted and np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE:
         held = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
         focal = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
         result = focal if result.cost - focal.cost > GAIN * focal.cost else result

@@ -30,7 +30,7 @@ def cautions(
     told = " ".join(from_readers)
     found = [*_about_place(summary, has_gps), *_about_images(summary)]
     found += [c for c in _about_heights(summary, altitudes) if "below" not in c.what or "below sea level" not in told]
-    found += _about_points(summary)
+    found += [*_about_points(summary), *_about_geoid(summary)]
     # The readers' sentences on left-out images are covered above, with what to do.
     covered = ("are skipped", "have no camera")
     return found + [Caution(text, "") for text in from_readers if not any(words in text for words in covered)]
@@ -46,12 +46,6 @@ def _about_place(summary: Mapping[str, Any], has_gps: bool) -> Iterator[Caution]
         yield Caution(
             "The map has no place on the Earth: it is in the cameras' own frame and the files carry no CRS.",
             "Give the origin in transforms.json (key overfly.origin) if it should lie in a GIS.",
-        )
-    if summary["heights"] == "ellipsoid":
-        yield Caution(
-            "Heights are those of the origin or the images' GPS, taken as above the ellipsoid: no geoid is applied.",
-            "For heights above the sea map with --heights egm96 or the EPSG code of a vertical CRS, for which PROJ "
-            "needs its geoid grid; or give ground control.",
         )
     if not has_gps and summary["cameras_from"] == "estimated":
         yield Caution(
@@ -104,12 +98,22 @@ def _about_heights(summary: Mapping[str, Any], altitudes: Altitudes) -> Iterator
             )
 
 
+def _about_geoid(summary: Mapping[str, Any]) -> Iterator[Caution]:
+    if summary["heights"] == "ellipsoid" and summary["settings"]["heights"] is None:
+        yield Caution(
+            "Heights are those of the origin or the images' GPS, taken as above the ellipsoid: no geoid is applied.",
+            "For heights above the sea map with --heights egm96 or the EPSG code of a vertical CRS, for which PROJ "
+            "needs its geoid grid; --heights ellipsoidal says that this is meant.",
+        )
+
+
 def _about_points(summary: Mapping[str, Any]) -> Iterator[Caution]:
     if (once := summary["seen_once_share"]) >= 0.02:
         where = f" ({area_text(once * summary['area'])})" if summary["metric"] else ""
         yield Caution(
             f"{once:.0%} of the mapped ground{where} is seen by one image only and cannot be measured there.",
-            "Fly with at least 60 % overlap along and across the lines.",
+            "At the rim of a flight that is usual: leave it out, or fly one line and one image more around the area; "
+            "within it fly with at least 60 % overlap along and across the lines.",
         )
     if (share := summary["predicted"] / max(summary["points"], 1)) >= 0.02:
         yield Caution(

@@ -78,7 +78,14 @@ def _way(text: str) -> tuple[Transformer, int | None]:
         if not crs.is_compound:
             return Transformer.from_crs(crs, "EPSG:4326", always_xy=True), None
         vertical = epsg_codes(crs)[1]
-        vertical_crs(str(vertical))  # says which grid is missing
+        try:
+            vertical_crs(str(vertical))
+        except InputError as error:
+            lacking = str(error).split(", or map with")[0].rstrip(".")
+            raise InputError(
+                f"The first line of gcp_list.txt, {text}, asks for it: {lacking[0].lower()}{lacking[1:]}; or write it "
+                "without the vertical CRS and the heights above the ellipsoid, or map with --control none."
+            ) from error
         return Transformer.from_crs(crs, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True), vertical
     except ProjError as error:
         raise _unfit(text, error) from error

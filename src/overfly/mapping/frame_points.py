@@ -110,7 +110,7 @@ def frame_points(
     votes = np.maximum(agree, data["support"])
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
-    known |= alone
+    known = (known | alone) & _shown(frame, own)
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
     rows, columns = np.nonzero(fresh)
@@ -162,6 +162,19 @@ def _look_up(
     inside = (u > 0) & (v > 0) & (u < other.camera.width - 1) & (v < other.camera.height - 1)
     # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
     return there / third, spread / third, was, inside, theirs
+
+
+def _shown(frame: Frame, own: DepthMap) -> NDArray[np.bool_]:
+    """Which pixels [H, W] of the depth map, which is without lens distortion, lie in the frame's image."""
+    assert frame.camera is not None
+    lens = frame.camera.resized(own.camera.width, own.camera.height)
+    if not lens.is_distorted:
+        return np.ones((lens.height, lens.width), bool)
+    matrix = lens.matrix()
+    matrix[:2, 2] -= 0.5
+    import cv2
+
+    return np.asarray(cv2.undistort(np.full((lens.height, lens.width), 255, np.uint8), matrix, lens.distortion) == 255)
 
 
 def _undistorted(frame: Frame, own: DepthMap) -> NDArray[np.uint8]:

@@ -1,7 +1,7 @@
 """Dense depth by classical stereo: rectified pairs, semi-global matching, consensus of pairs, sub-pixel correlation.
 
-Pairs are matched at half the working size, which costs an eighth of the time and loses nothing: the last pixel comes
-from the correlation of full-size images around each depth (:mod:`overfly.mapping.subpixel`), in which all neighbouring
+Pairs are matched at half the working size, which costs an eighth of the time; but not under 800 pixels, where roofs and
+walls would be lost (recall at 1 m 0.64 instead of 0.70 on 800-pixel images of a suburb). The last pixel comes from the correlation of full-size images around each depth (:mod:`overfly.mapping.subpixel`), in which all neighbouring
 frames take part. Everything finished is kept in the work folder, so that a killed run goes on; memory holds a few
 frames at a time whatever the size of the flight.
 """

@@ -13,6 +13,9 @@ from overfly.flights import Frame
 from overfly.geometry import Camera
 from overfly.mapping.subpixel import Shot
 
+LEAST_MATCHED = 800
+"""Longest side, pixels, at which pairs are matched at the least, where images have so many."""
+
 
 class Views:
     """Images and cameras of a flight at the two sizes, a few images in memory."""
@@ -25,7 +28,7 @@ class Views:
             assert frame.camera is not None
             factor = min(1.0, max_size / max(frame.width, frame.height))
             self.lens.append(frame.camera.resized(round(frame.width * factor), round(frame.height * factor)))
-        self.half_lens = [c.resized(max(16, c.width // 2), max(16, c.height // 2)) for c in self.lens]
+        self.half_lens = [_for_matching(c) for c in self.lens]
         self.full = [c.undistorted() for c in self.lens]
         self.half = [c.undistorted() for c in self.half_lens]
         self.gray = lru_cache(maxsize=12)(self._gray)
@@ -51,7 +54,7 @@ class Views:
         return cv2.resize(self.gray(i), size, interpolation=cv2.INTER_AREA)
 
     def half_shot(self, i: int) -> Shot:
-        """The undistorted frame at half the working size."""
+        """The undistorted frame at the size at which pairs are matched."""
         import cv2
 
         whole, half = self.shot(i), self.half[i]
@@ -68,3 +71,10 @@ class Views:
             matrix[:2, 2] -= 0.5
             image = cv2.undistort(image, matrix, lens.distortion)
         return Shot(image.astype(np.float32), self.full[i], self.poses[i])
+
+
+def _for_matching(camera: Camera) -> Camera:
+    """The camera at half the size, but not under :data:`LEAST_MATCHED`: smaller pictures lose roofs and walls."""
+    longest = max(camera.width, camera.height)
+    factor = max(0.5, min(1.0, LEAST_MATCHED / longest))
+    return camera.resized(max(16, round(camera.width * factor)), max(16, round(camera.height * factor)))
