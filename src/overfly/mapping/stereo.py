@@ -1,9 +1,10 @@
 """Dense depth by classical stereo: rectified pairs, semi-global matching, consensus of pairs, sub-pixel correlation.
 
 Pairs are matched at half the working size, which costs an eighth of the time; but not under 800 pixels, where roofs and
-walls would be lost (recall at 1 m 0.64 instead of 0.70 on 800-pixel images of a suburb). The last pixel comes from the correlation of full-size images around each depth (:mod:`overfly.mapping.subpixel`), in which all neighbouring
-frames take part. Everything finished is kept in the work folder, so that a killed run goes on; memory holds a few
-frames at a time whatever the size of the flight.
+walls would be lost (recall at 1 m 0.64 instead of 0.70 on 800-pixel images of a suburb). The last pixel comes from the
+correlation of full-size images around each depth (:mod:`overfly.mapping.subpixel`), in which all neighbouring frames
+take part. Everything finished is kept in the work folder, so that a killed run goes on; memory holds a few frames at a
+time whatever the size of the flight.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ Opinions = Callable[[int, list[int], Array], Opinion | None]
 Progress = Callable[[int, int], None]
 BASE_TO_HEIGHT = (0.04, 0.9)
 DISPARITY_SIGMA = 0.4
-"""Standard deviation of a semi-global disparity, pixels of the matched (half) size."""
+"""Standard deviation of a semi-global disparity, pixels of the matched size."""
 
 REFINED_SIGMA = 0.25
 """The same after refinement, pixels of the full size."""
@@ -180,7 +181,7 @@ def _layout(
     """Left frame, right frame and their rectification, None where it is not possible."""
     i, j = pair if ordered((flight.poses[pair[0]], flight.poses[pair[1]])) else pair[::-1]
     layout = rectify(
-        (flight.half_lens[i], flight.half_lens[j]),
+        (flight.matched_lens[i], flight.matched_lens[j]),
         (flight.poses[i], flight.poses[j]),
         ((ranges[i][0], ranges[i][2]), (ranges[j][0], ranges[j][2])),
     )
@@ -193,8 +194,8 @@ def _match(flight: Views, pair: tuple[int, int], ranges: list[tuple[float, float
     found = np.zeros((0, 0), np.int16)
     if layout is not None:
         found = disparities(
-            (flight.half_gray(i), flight.half_gray(j)),
-            (flight.half_lens[i], flight.half_lens[j]),
+            (flight.matched_gray(i), flight.matched_gray(j)),
+            (flight.matched_lens[i], flight.matched_lens[j]),
             (flight.poses[i], flight.poses[j]),
             layout,
         )
@@ -208,7 +209,7 @@ def _match(flight: Views, pair: tuple[int, int], ranges: list[tuple[float, float
 def _at_full_size(
     flight: Views, i: int, chosen: list[int], depth: Map, support: NDArray[np.uint8]
 ) -> dict[str, NDArray]:
-    """A depth map of half the size, refined at full size: depth, sigma, support and score."""
+    """A depth map of the matched size, refined at full size: depth, sigma, support and score."""
     import cv2
 
     size = (flight.full[i].width, flight.full[i].height)
@@ -245,27 +246,27 @@ def _depth(
         if layout is None or not match.size:
             continue
         seen = match if left == i else right_disparities(match)
-        depth = depth_in_frame(seen, flight.half[i], flight.poses[i], layout, right=left != i)
+        depth = depth_in_frame(seen, flight.matched[i], flight.poses[i], layout, right=left != i)
         depths.append(depth)
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
-    half = flight.half[i]
-    shape = half.height, half.width
+    small = flight.matched[i]
+    shape = small.height, small.width
     if depths:
         depth, _, support = consensus(depths, sigmas)
     else:
         depth, support = np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
     full = _at_full_size(flight, i, chosen, depth, support)
     paired = np.isfinite(full["depth"])
-    opinion = None if ask is None else ask(i, chosen, _sample(depth, half, flight.poses[i]))
+    opinion = None if ask is None else ask(i, chosen, _sample(depth, small, flight.poses[i]))
     if opinion is not None:
         # It has no vote where pairs were matched: with its wide sigma it would agree with wrong matches, too.
         said = cv2.resize(opinion.depth, shape[::-1], interpolation=cv2.INTER_LINEAR)
         seen_again = cv2.resize(opinion.views, shape[::-1], interpolation=cv2.INTER_NEAREST) >= 2
         fill = ~np.isfinite(depth) & seen_again & np.isfinite(said)
         # The network is less exact than a pair: it may be off by more than the last step's pixel.
-        others = [flight.half_shot(j) for j in chosen]
+        others = [flight.matched_shot(j) for j in chosen]
         guess = np.where(fill, said, np.float32(np.nan))
-        moved = refine(flight.half_shot(i), others, guess, steps=(-2, -1, 0, 1, 2))
+        moved = refine(flight.matched_shot(i), others, guess, steps=(-2, -1, 0, 1, 2))
         filled = _at_full_size(flight, i, chosen, moved.depth, np.isfinite(moved.depth).astype(np.uint8))
         full = {name: np.where(paired, values, filled[name]) for name, values in full.items()}
         sure = np.where((full["score"] >= SURE) & (full["support"] >= 1), full["depth"], np.float32(np.nan))

@@ -18,7 +18,7 @@ LEAST_MATCHED = 800
 
 
 class Views:
-    """Images and cameras of a flight at the two sizes, a few images in memory."""
+    """Images and cameras of a flight at the working size and the size at which pairs are matched, a few in memory."""
 
     def __init__(self, frames: Sequence[Frame], max_size: int) -> None:
         self.frames = frames
@@ -28,9 +28,9 @@ class Views:
             assert frame.camera is not None
             factor = min(1.0, max_size / max(frame.width, frame.height))
             self.lens.append(frame.camera.resized(round(frame.width * factor), round(frame.height * factor)))
-        self.half_lens = [_for_matching(c) for c in self.lens]
+        self.matched_lens = [_for_matching(c) for c in self.lens]
         self.full = [c.undistorted() for c in self.lens]
-        self.half = [c.undistorted() for c in self.half_lens]
+        self.matched = [c.undistorted() for c in self.matched_lens]
         self.gray = lru_cache(maxsize=12)(self._gray)
         self.shot = lru_cache(maxsize=12)(self._shot)
 
@@ -47,19 +47,19 @@ class Views:
         assert camera_of is not None
         return resample(self.frames[i].image(), camera_of, camera)
 
-    def half_gray(self, i: int) -> NDArray[np.uint8]:
+    def matched_gray(self, i: int) -> NDArray[np.uint8]:
         import cv2
 
-        size = (self.half[i].width, self.half[i].height)
+        size = (self.matched[i].width, self.matched[i].height)
         return cv2.resize(self.gray(i), size, interpolation=cv2.INTER_AREA)
 
-    def half_shot(self, i: int) -> Shot:
+    def matched_shot(self, i: int) -> Shot:
         """The undistorted frame at the size at which pairs are matched."""
         import cv2
 
-        whole, half = self.shot(i), self.half[i]
-        gray = cv2.resize(whole.gray, (half.width, half.height), interpolation=cv2.INTER_AREA)
-        return Shot(gray, half, self.poses[i])
+        whole, small = self.shot(i), self.matched[i]
+        gray = cv2.resize(whole.gray, (small.width, small.height), interpolation=cv2.INTER_AREA)
+        return Shot(gray, small, self.poses[i])
 
     def _shot(self, i: int) -> Shot:
         import cv2
