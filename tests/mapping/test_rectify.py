@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from overfly.geometry import Camera, pose, project, rotation_from_gimbal
+from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities, right_disparities
 from overfly.mapping.rectify import ordered, rectify
 
@@ -76,6 +77,15 @@ def test_frames_that_look_along_their_baseline_or_apart_are_refused(camera: Came
     assert rectify((camera, camera), (same, same), ((70, 90), (70, 90))) is None
 
 
+def test_a_wrong_point_close_to_a_camera_makes_no_canvas_without_end(camera: Camera) -> None:
+    poses = two("along the rows")
+    pair = rectify((camera, camera), (poses[0], poses[1]), ((0.5, 90), (70, 90)))
+    assert pair is not None
+    assert pair.size[0] < 4 * camera.width
+    assert pair.disparity(pair.nearest) - pair.disparity(pair.farthest) == pytest.approx(camera.width)
+    assert pair.farthest == pytest.approx(99)
+
+
 def test_the_nearest_surface_wins_in_the_right_canvas() -> None:
     left = np.full((1, 8), UNKNOWN, np.int16)
     left[0, 5], left[0, 4] = 3 * 16, 2 * 16  # both land in column 2
@@ -92,3 +102,14 @@ def test_pictures_of_nothing_match_nowhere(camera: Camera, tmp_path: Path) -> No
     blank = np.full((240, 320), 120, np.uint8)
     found = disparities((blank, blank), (camera, camera), (poses[0], poses[1]), layout)
     assert (found == UNKNOWN).all()
+
+
+def test_two_wrong_points_of_a_frame_do_not_widen_its_depths(camera: Camera) -> None:
+    down = pose(rotation_from_gimbal(0, -90), [0, 0, 80])
+    points = np.column_stack([np.random.default_rng(0).uniform(-15, 15, (60, 2)), np.zeros(60)])
+    points[:2, 2] = 76.0, 70.0
+    points[:2, :2] *= 0.02
+    nearest, middle, farthest = depth_ranges([camera], [down], points)[0]
+    assert middle == pytest.approx(80)
+    assert nearest > 70
+    assert farthest < 90

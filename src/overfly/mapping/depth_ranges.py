@@ -10,6 +10,9 @@ from overfly.errors import InputError
 from overfly.geometry import Array, Camera, project
 from overfly.mapping.culling import Groups
 
+STRAYS = 2.5
+"""Points of a frame at either end that may be wrong: of few points half a per cent is none."""
+
 BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
@@ -28,7 +31,8 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
         if inside.sum() < 20:
             found.append(None)
             continue
-        low, middle, high = np.quantile(depth[inside], [0.005, 0.5, 0.995])
+        rare = max(0.005, STRAYS / int(inside.sum()))
+        low, middle, high = np.quantile(depth[inside], [rare, 0.5, 1 - rare])
         # Roofs and tree tops have few key points: leave room above.
         margin = 0.15 * (high - low) + 0.02 * middle
         found.append((max(low - 1.5 * margin, 0.05 * middle), float(middle), float(high + margin)))

@@ -98,6 +98,9 @@ def rectify(
     nearest = max(min(ranges[0][0], ranges[1][0]) * 0.9, 1e-6)
     farthest = max(ranges[0][1], ranges[1][1]) * 1.1
     most, least = focal * baseline / nearest, focal * baseline / farthest
+    # Single wrong points close to a camera ask for disparities without end; nothing matches over a whole image.
+    most = min(most, least + max(cam_l.width, cam_r.width))
+    nearest = focal * baseline / most
     (l0, l1), (r0, r1) = boxes[0][0] * focal, boxes[1][0] * focal
     top, bottom = (f(boxes[0][1][i], boxes[1][1][i]) * focal for f, i in ((max, 0), (min, 1)))
     pad = (most - least) / 2 + 8
