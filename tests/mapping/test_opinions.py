@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from overfly.flights import Frame
 from overfly.geometry import Camera, pixel_grid, rays
-from overfly.mapping.depth_map import Opinion
+from overfly.mapping.depth_map import DepthMap, Opinion
+from overfly.mapping.frame_points import frame_points
 from overfly.mapping.fuse import fuse
 from overfly.mapping.stereo import stereo
 from overfly.mapping.sweep import SweepOpinions, octave_camera
@@ -136,3 +140,26 @@ def test_where_nothing_matches_the_networks_word_stands_and_is_marked(hill, stri
     far, _ = cKDTree(measured.points[:, :2]).query(cloud.points[cloud.predicted][:, :2])
     assert np.median(far) > 2.0  # predicted points lie where nothing was measured
     assert cloud.views[cloud.predicted].max() == 1
+
+
+@pytest.mark.parametrize(("sure", "share"), [(0.5, 0.5), (0.8, 1.0)])
+def test_a_word_alone_must_be_surer_where_other_frames_see_the_place_too(
+    camera: Camera, sure: float, share: float, tmp_path: Path
+) -> None:
+    """What other frames have inside and could not match is mostly wood and water, where networks err, too."""
+    shape = camera.height, camera.width
+    once = np.zeros(shape, bool)
+    once[:, : camera.width // 2] = True
+    data = {
+        "depth": np.full(shape, 50, np.float32), "sigma": np.ones(shape, np.float32),
+        "support": np.zeros(shape, np.uint8), "score": np.full(shape, -1, np.float32),
+        "paired": np.zeros(shape, bool), "guessed": np.ones(shape, bool),
+        "second": np.ones(shape, bool), "sure": np.full(shape, sure, np.float32), "once": once,
+    }  # fmt: skip
+    own = DepthMap("a", camera, np.eye(4), [], tmp_path / "a.npz")
+    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
+    Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
+    cloud, *_ = frame_points(own, data, [], frame, single=True)
+    assert cloud.predicted is not None
+    assert cloud.predicted.all()
+    assert len(cloud) == pytest.approx(share * once.size, abs=camera.height)

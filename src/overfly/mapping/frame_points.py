@@ -19,6 +19,9 @@ GATE = 3.0
 WORST_SCORE = {True: 0.2, False: 0.45}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
 
+SURE_THOUGH_SEEN = 0.7
+"""Confidence from which on a network's word alone stands where other frames have the place inside and match nothing."""
+
 WIDEST = 2.0
 """Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
 
@@ -60,6 +63,7 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
         "guessed": guessed,
         "second": guessed | ~data["paired"],
         "sure": sure,
+        "once": cv2.resize(opinion.views, size, interpolation=cv2.INTER_NEAREST) < 2,
     }
 
 
@@ -110,6 +114,8 @@ def frame_points(
     votes = np.maximum(agree, data["support"])
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
+    if "once" in data:
+        alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN)
     known = (known | alone) & _shown(frame, own)
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
