@@ -47,7 +47,7 @@ class MapSettings:
         ply: write ``cloud.ply`` too.
         mesh: write the textured mesh ``mesh.glb`` too; one that an earlier map left is removed.
         mesh_faces: about so many triangles; None: :data:`MESH_FACES`. Only with ``mesh``.
-        size: longest side at which images are worked on, pixels: 800 instead of 1600 takes two fifths of the dense time.
+        size: longest side at which images are worked on, pixels: 800 for 1600 takes two fifths of the dense time.
         seed: of every random choice.
         progress: tell each step on stderr.
     """
