@@ -26,7 +26,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from truth.case import CELLS, Case, measure
+from truth.case import CELLS, Case, measure, text
 from truth.cost import run_measured
 
 from overfly.metrics.functional import THRESHOLDS_M
@@ -101,9 +101,6 @@ def means(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The main figures as markdown, a line for each flight and method."""
-
-    def text(row: dict[str, Any], *keys: str, digits: int = 2) -> str:
-        return " / ".join("-" if row.get(k) is None else f"{row[k]:.{digits}f}" for k in keys)
 
     lines = [
         {

@@ -27,7 +27,7 @@ import numpy as np
 import pycolmap
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from truth.case import CELLS, Case, measure
+from truth.case import CELLS, Case, measure, text
 from truth.cost import run_measured
 from truth.stock import cameras_of
 
@@ -156,9 +156,6 @@ def figures(method: str, case: Case, ppg: str | None, *, anew: bool) -> dict[str
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The main figures as markdown, a line for each flight and method."""
-
-    def text(row: dict[str, Any], *keys: str, digits: int = 2) -> str:
-        return " / ".join("-" if row.get(k) is None else f"{row[k]:.{digits}f}" for k in keys)
 
     lines = [
         {

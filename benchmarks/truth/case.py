@@ -167,3 +167,8 @@ def measure(case: Case, cloud: Cloud) -> dict[str, Any]:
 def share(true: NDArray[np.bool_], among: NDArray[np.bool_]) -> float | None:
     """The part of ``among`` where ``true`` holds; None of nothing."""
     return float(true[among].mean()) if among.any() else None
+
+
+def text(row: dict[str, Any], *keys: str, digits: int = 2) -> str:
+    """Figures of a row beside each other, a dash for each that it lacks."""
+    return " / ".join("-" if row.get(k) is None else f"{row[k]:.{digits}f}" for k in keys)

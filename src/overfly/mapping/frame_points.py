@@ -116,14 +116,14 @@ def frame_points(
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
         alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN)
-    known = (known | alone) & _shown(frame, own)
+    image, shown = _shown(frame, own)
+    known = (known | alone) & shown
     fresh = known & ~taken
     merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = unproject(pixels, merged, own.camera, own.world_from_camera)
     votes = votes[fresh]
-    image = _undistorted(frame, own)
     cloud = Cloud(
         points,
         image[rows, columns],
@@ -170,21 +170,8 @@ def _look_up(
     return there / third, spread / third, was, inside, theirs
 
 
-def _shown(frame: Frame, own: DepthMap) -> NDArray[np.bool_]:
-    """Which pixels [H, W] of the depth map, which is without lens distortion, lie in the frame's image."""
-    assert frame.camera is not None
-    lens = frame.camera.resized(own.camera.width, own.camera.height)
-    if not lens.is_distorted:
-        return np.ones((lens.height, lens.width), bool)
-    matrix = lens.matrix()
-    matrix[:2, 2] -= 0.5
-    import cv2
-
-    return np.asarray(cv2.undistort(np.full((lens.height, lens.width), 255, np.uint8), matrix, lens.distortion) == 255)
-
-
-def _undistorted(frame: Frame, own: DepthMap) -> NDArray[np.uint8]:
-    """The frame's image in the pixels of its depth map."""
+def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The frame's image in the pixels of its depth map [H, W, 3], and which of them [H, W] the lens has shown."""
     import cv2
 
     assert frame.camera is not None
@@ -192,11 +179,12 @@ def _undistorted(frame: Frame, own: DepthMap) -> NDArray[np.uint8]:
     image = frame.image()
     if image.shape[:2] != (lens.height, lens.width):
         image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-    if not lens.is_distorted:
-        return image
-    matrix = lens.matrix()
-    matrix[:2, 2] -= 0.5
-    return np.asarray(cv2.undistort(image, matrix, lens.distortion))
+    whole = np.full(image.shape[:2], 255, np.uint8)
+    if lens.is_distorted:
+        matrix = lens.matrix()
+        matrix[:2, 2] -= 0.5
+        image, whole = (np.asarray(cv2.undistort(part, matrix, lens.distortion)) for part in (image, whole))
+    return image, whole == 255
 
 
 def _confidence(votes: NDArray, agree: NDArray, score: NDArray) -> NDArray[np.float32]:
