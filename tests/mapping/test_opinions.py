@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -163,3 +163,20 @@ def test_a_word_alone_must_be_surer_where_other_frames_see_the_place_too(
     assert cloud.predicted is not None
     assert cloud.predicted.all()
     assert len(cloud) == pytest.approx(share * once.size, abs=camera.height)
+
+
+def test_no_point_comes_from_where_the_lens_has_shown_nothing(camera: Camera, tmp_path: Path) -> None:
+    """Undistorted, a picture has an empty rim: points there were black."""
+    shape = camera.height, camera.width
+    lens = replace(camera, k1=0.3)
+    data = {name: np.ones(shape, np.float32) for name in ("sigma", "sure")} | {
+        name: np.ones(shape, bool) for name in ("guessed", "second", "once")
+    }
+    data |= {"depth": np.full(shape, 50, np.float32), "support": np.zeros(shape, np.uint8)}
+    data |= {"score": np.full(shape, -1, np.float32), "paired": np.zeros(shape, bool)}
+    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=lens)
+    Image.fromarray(np.full((*shape, 3), 200, np.uint8)).save(frame.path)
+    cloud, *_ = frame_points(DepthMap("a", camera, np.eye(4), [], tmp_path / "a.npz"), data, [], frame, single=True)
+    assert 0.3 * camera.width * camera.height < len(cloud) < 0.98 * camera.width * camera.height
+    assert cloud.colors is not None
+    assert cloud.colors.min() > 190

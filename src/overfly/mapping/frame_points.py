@@ -93,19 +93,16 @@ def frame_points(
     widest = WIDEST * depth / own.camera.fx
     weight = 1 / sigma**2
     total, mean = weight.copy(), weight * depth
-    agree, deny, seen = (np.zeros(depth.shape, np.uint8) for _ in range(3))
+    agree = np.zeros(depth.shape, np.uint8)
     taken = np.zeros(depth.shape, bool)
     for partner, other, before in partners:
-        found, spread, given, inside, theirs = _look_up(own, depth, partner, other, before)
+        found, spread, given, theirs = _look_up(own, depth, partner, other, before)
         # What pairs have matched is judged by what pairs have matched alone: the cloud of them is that of stereo.
         found = np.where(theirs & ~second, np.float32(np.nan), found)
         with np.errstate(invalid="ignore"):
             gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
             same = np.abs(found - depth) < gate
-            # The other frame looks through this point at something behind it.
-            deny += found - depth > gate
         agree += same
-        seen += inside
         taken |= same & given
         w = np.where(same, 1 / spread**2, 0)
         total += w
@@ -143,9 +140,9 @@ def frame_points(
 
 def _look_up(
     own: DepthMap, depth: Map, other: DepthMap, data: Mapping[str, NDArray], given: NDArray[np.bool_] | None
-) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given, whether
-    the other frame has the place inside at all, and whether no pair has matched it there."""
+) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_]]:
+    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given, and
+    whether no pair has matched it there."""
     import cv2
 
     q, t = frame_to_frame(own.camera, own.world_from_camera, other.camera, other.world_from_camera)
@@ -165,9 +162,8 @@ def _look_up(
         else cv2.remap(mask.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
         for mask in (given, data.get("second"))
     )
-    inside = (u > 0) & (v > 0) & (u < other.camera.width - 1) & (v < other.camera.height - 1)
     # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
-    return there / third, spread / third, was, inside, theirs
+    return there / third, spread / third, was, theirs
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
