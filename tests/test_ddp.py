@@ -124,7 +124,8 @@ def test_a_batch_that_does_not_split_is_refused(monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(torch.distributed, name, lambda value=value: value)
     windows = {
         "frames": 3, "points": 1024, "choice": "overlap", "ground_sigma_m": 2.0, "position_sigma_m": 1.0,
-        "rotation_sigma_deg": 1.0, "drop_share": 0.0, "light_sigma": 0.0, "camera_sigma_px": 0.0, "shrink": 1,
+        "rotation_sigma_deg": 1.0, "drop_share": 0.0, "light_sigma": 0.0, "colour_sigma": 0.0,
+        "camera_sigma_px": 0.0, "shrink": 1,
     }  # fmt: skip
     data = FlightDataModule(source=None, windows=windows, batch_size=5, workers=0, seed=0)  # type: ignore[arg-type]
     data.datasets["train"] = [None] * 8  # type: ignore[assignment]

@@ -10,6 +10,8 @@ import torch
 from omegaconf import OmegaConf
 
 from overfly.errors import InputError
+from overfly.run import load_run
+from overfly.run_folder import checkpoint, read_weights
 from overfly.shipped import DEFAULT, WEIGHTS, export, load_network, names
 from terrain import SWEEP_SIZES, make_batch, make_sweep_network
 
@@ -67,3 +69,18 @@ def test_the_default_network_is_small_and_trained() -> None:
 def test_an_unknown_network_says_what_there_is(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"neither a shipped network \(.*\) nor a run folder"):
         load_network(str(tmp_path / "nowhere"))
+
+
+def test_a_shipped_network_is_something_to_start_from() -> None:
+    path = checkpoint(Path(DEFAULT))
+    assert path == WEIGHTS / f"{DEFAULT}.safetensors"
+    weights, network = read_weights(path), load_network().network
+    assert set(weights) == {f"network.{key}" for key in network.state_dict()}
+    assert torch.equal(weights["network.encoder.stem.0.weight"], network.state_dict()["encoder.stem.0.weight"])
+
+
+def test_what_is_neither_a_run_nor_a_shipped_network_is_told() -> None:
+    with pytest.raises(InputError, match=r"no run folder bass: .* a shipped network \(base\)"):
+        checkpoint(Path("bass"))
+    with pytest.raises(InputError, match="only the weights are here"):
+        load_run(DEFAULT)

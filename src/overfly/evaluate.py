@@ -14,6 +14,7 @@ from overfly.errors import InputError
 from overfly.evaluation import Baselines, Network, evaluate
 from overfly.evaluation.evaluate import KEPT
 from overfly.run import Run, load_run
+from overfly.shipped import load_network
 
 log = logging.getLogger("overfly")
 
@@ -25,7 +26,7 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     """Evaluate ``from_run`` and ``networks`` on the test and unseen flights of a configuration.
 
     Args:
-        cfg: with ``from_run``, ``networks`` (run folders by the name in the table), ``emd_windows``, ``every`` and
+        cfg: with ``from_run``, ``networks`` (run folders or shipped networks by the name in the table), ``emd_windows``, ``every`` and
             ``draws``.
         run_dir: gets evaluation.md, evaluation.csv and evaluation.png; with ``resume`` it goes on where it stopped.
 
@@ -39,7 +40,7 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
         raise InputError("stage=evaluate needs a trained network: give from_run=outputs/all/<a run folder>.")
     run = load_run(cfg.from_run)
     own = _name(run)
-    others = {str(name): load_run(folder) for name, folder in (cfg.networks or {}).items()}
+    others = {str(name): load_network(str(folder)) for name, folder in (cfg.networks or {}).items()}
     if own in others:
         raise InputError(
             f"networks calls one {own!r}, which is the name of from_run in the table: choose another name."
@@ -85,7 +86,7 @@ def _name(run: Run) -> str:
 
 def _width(run: Run) -> int:
     """Width of the images that a network was trained with last, pixels."""
-    return int(run.config["image_size"][0]) // int(run.config["windows"]["shrink"])
+    return int(run.config["image_size"][0]) // int(run.config.get("windows", {"shrink": 1})["shrink"])
 
 
 def _training_data(run: Run, cache_dir: str) -> Any:

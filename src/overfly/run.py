@@ -223,6 +223,11 @@ def load_run(folder: Path | str) -> Run:
         raise InputError(
             f"{folder} holds no checkpoints/best.ckpt: train first (python train.py), then give its run folder."
         )
+    if path.suffix == ".safetensors":
+        raise InputError(
+            f"{folder} is a shipped network, of which only the weights are here: give a run folder. "
+            f"stage=full from_run={folder} trains it further, networks={{shipped: {folder}}} evaluates it beside a run."
+        )
     register_resolvers()
     root = path.parent.parent
     cfg = OmegaConf.load(root / "config.yaml")

@@ -14,16 +14,25 @@ if TYPE_CHECKING:
     import torch
 
 
+WEIGHTS = Path(__file__).parent / "weights"
+"""Where the shipped networks lie, as ``NAME.safetensors`` and ``NAME.json``."""
+
+
 def checkpoint(folder: Path) -> Path | None:
-    """The best checkpoint of a run folder, None if there is none.
+    """The best checkpoint of a run folder, or the weights of a shipped network by its name; None if there are none.
 
     Raises:
-        InputError: the folder does not exist.
+        InputError: there is neither such a folder nor such a network.
     """
+    if not folder.exists() and (shipped := WEIGHTS / f"{folder}.safetensors").is_file():
+        return shipped
     if folder.is_file():
         return folder
     if not folder.is_dir():
-        raise InputError(f"There is no run folder {folder}: give a folder that train.py wrote, such as outputs/all/...")
+        raise InputError(
+            f"There is no run folder {folder}: give a folder that train.py wrote, such as outputs/all/..., "
+            f"or a shipped network ({', '.join(sorted(path.stem for path in WEIGHTS.glob('*.safetensors')))})."
+        )
     for part in (folder, folder / "full", folder / "gan", folder / "encoder"):
         if (part / "checkpoints" / "best.ckpt").is_file():
             return part / "checkpoints" / "best.ckpt"
@@ -31,9 +40,13 @@ def checkpoint(folder: Path) -> Path | None:
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
-    """The state dict of a checkpoint (plain tensors only, nothing is unpickled)."""
+    """The state dict of a checkpoint or of a shipped network (plain tensors only, nothing is unpickled)."""
     import torch
 
+    if path.suffix == ".safetensors":
+        from safetensors.torch import load_file
+
+        return {f"network.{key}": value for key, value in load_file(path).items()}
     weights: dict[str, torch.Tensor] = torch.load(path, map_location="cpu", weights_only=True)["state_dict"]
     return weights
 

@@ -13,9 +13,7 @@ from overfly.configuration import build, register_resolvers
 from overfly.errors import InputError
 from overfly.files import replacing
 from overfly.run import Run, load_run
-from overfly.run_folder import checkpoint
-
-WEIGHTS = Path(__file__).parent / "weights"
+from overfly.run_folder import WEIGHTS, checkpoint
 
 DEFAULT = "base"
 """The network that maps are made with if none is named."""

@@ -9,7 +9,7 @@ import pytest
 import torch
 from plane import CAMERA, make_record, surface
 
-from overfly.data.dataset import WindowDataset, WindowSampler, WindowSettings, mirrored, reference_points
+from overfly.data.dataset import WindowDataset, WindowSampler, WindowSettings, mirrored, recoloured, reference_points
 from overfly.data.footprints import footprint
 from overfly.data.record import write_record
 from overfly.data.windows import to_world, window_frame
@@ -26,6 +26,7 @@ EXACT = WindowSettings(
     shrink=1,
     drop_share=0.0,
     light_sigma=0.0,
+    colour_sigma=0.0,
     camera_sigma_px=0.0,
 )
 SETTINGS = replace(EXACT, position_sigma_m=1.0, rotation_sigma_deg=1.0)
@@ -148,3 +149,14 @@ def test_a_mirrored_window_is_one_that_could_have_been_flown() -> None:
         width = sample["images"].shape[3]
         assert pixels[1] == pytest.approx([width - pixels[0][0], pixels[0][1]], abs=1e-3)
     np.testing.assert_array_equal(mirrored(swapped)["images"], sample["images"])
+
+
+def test_other_colours_are_the_same_in_all_frames_of_a_window() -> None:
+    image = np.random.default_rng(0).uniform(0.3, 0.7, (1, 3, 8, 8)).astype(np.float32)
+    twice = np.concatenate([image, image])
+    found = recoloured(twice, 0.3, np.random.default_rng(1))
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+    assert np.abs(found - twice).max() > 0.02
+    assert found.min() >= 0
+    assert found.max() <= 1
+    np.testing.assert_allclose(recoloured(twice, 0.0, np.random.default_rng(1)), twice, atol=1e-6)

@@ -36,6 +36,7 @@ class WindowSettings:
     rotation_sigma_deg: float
     drop_share: float
     light_sigma: float
+    colour_sigma: float
     camera_sigma_px: float
     shrink: int
 
@@ -89,6 +90,8 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
         )
         scale = float(sample["scale"])
         if self.augment:
+            if settings.colour_sigma:
+                sample["images"] = recoloured(sample["images"], settings.colour_sigma, rng)
             sample["images"] = relit(sample["images"], settings.light_sigma, rng)
             turns = np.degrees(settings.camera_sigma_px / cameras[0].fx)
             shaken = disturbed(poses, 0.0, turns, rng)
@@ -179,6 +182,17 @@ def relit(images: NDArray[np.float32], sigma: float, rng: np.random.Generator) -
     gain = np.exp(rng.normal(0, sigma, (len(images), 1, 1, 1)) + rng.normal(0, sigma / 3, (len(images), 3, 1, 1)))
     gamma = np.exp(rng.normal(0, sigma, (len(images), 1, 1, 1)))
     return np.clip(gain * np.maximum(images, 1e-4) ** gamma, 0, 1).astype(np.float32)
+
+
+def recoloured(images: NDArray[np.float32], sigma: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Images [K, 3, H, W] in 0..1, all with the same other colours: surfaces that the trained styles do not have.
+
+    Channels are mixed about their mean by a matrix that is the identity within ``sigma``, and all scaled by one factor.
+    """
+    mixing = (np.eye(3) + rng.normal(0, sigma, (3, 3))) * np.exp(rng.normal(0, sigma))
+    mean = images.mean((0, 2, 3), keepdims=True)
+    mixed = np.einsum("ij,kjhw->kihw", mixing, images - mean)
+    return np.clip(mixed + mean, 0, 1).astype(np.float32)
 
 
 def mirrored(sample: dict[str, NDArray]) -> dict[str, NDArray]:

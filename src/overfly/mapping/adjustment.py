@@ -143,11 +143,21 @@ def adjusted(
     lever: Array | None = None,
     datum: Array | None = None,
     tolerance: float = TOLERANCE,
+    patience: int = MOST_STEPS,
 ) -> Adjusted:
-    """The bundle that fits its images and what is known best, from a start near it; deterministic."""
+    """The bundle that fits its images and what is known best, from a start near it; deterministic.
+
+    Args:
+        bundle: the start.
+        held: what is known.
+        lever, datum: of the antenna and of GPS as a whole, to start with.
+        tolerance: gain of half the sum of squares below which a free step is the last one.
+        patience: steps of less gain, damped or not, one after another, that are the last ones.
+    """
     state = Adjusted(bundle, held, np.zeros(3) if lever is None else lever, np.zeros(3) if datum is None else datum)
     cost, damping = _cost(state), 1e-7
     images = _images(state)
+    slow = 0
     for _ in range(MOST_STEPS):
         while True:
             step = Reduced(images, _rows(state), damping=damping).solve()
@@ -160,7 +170,8 @@ def adjusted(
             break
         gain, state, cost = cost - found, trial, found
         images = _images(state)
-        if gain < tolerance and damping <= FREE_STEP:  # damped steps are short, whatever is still to gain
+        slow = slow + 1 if gain < tolerance else 0
+        if slow and (damping <= FREE_STEP or slow >= patience):  # damped steps are short, whatever is still to gain
             break
         damping = max(damping / 10, 1e-10)
     freedom = 2 * len(bundle.image) - 6 * len(bundle) - 3 * len(bundle.points)

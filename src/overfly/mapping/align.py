@@ -15,7 +15,7 @@ from overfly.geometry import Array
 from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
 from overfly.mapping.bundle import Bundle, bundle_of
-from overfly.mapping.calibration import FOCAL_SUSPECT, adjusted_twice, calibrated, focal_drift, held_by_images
+from overfly.mapping.calibration import FOCAL_TRIED, adjusted_twice, calibrated, held_by_images
 from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, strongest_pair
@@ -66,6 +66,8 @@ def align(
         InputError: fewer than two images could be placed, or the CRS of the controls cannot be used.
     """
     import pycolmap
+    import scipy.linalg  # noqa: F401  # brings a BLAS of its own, which is limited below
+    from threadpoolctl import threadpool_limits
 
     # Warnings of the sparse solver speak of its inside; what matters is said in the block's own warnings.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -83,25 +85,38 @@ def align(
             "keep the photos' EXIF, or give a calibrated camera."
         )
     with bar("cameras", "models") as update:
-        names = [frame.name for frame in flight.frames]
-        models = mapped(database, flight.root, workdir, names=names, seed=seed)
+        parts = _sparse(database, flight, guessed, workdir, seed)
         update(1, 2)
-        if not models:
+        if not parts:
             raise InputError(
                 f"No two of the {len(flight)} images could be placed together (best pair: "
                 f"{strongest_pair(database)} common points, 15 needed): give sharp images that overlap by 30 % or more."
             )
-        numbers = {name: i for i, name in enumerate(names)}
-        parts = [bundle_of(model, numbers) for model in models]
-        drift = focal_drift(parts[0], flight.frames)
-        if drift > FOCAL_SUSPECT:
-            # Over flat ground a focal length without limits may run away, and everything with it.
-            models = mapped(database, flight.root, workdir / "held", names=names, seed=seed, calibrate=False)
-            held = [bundle_of(model, numbers) for model in models]
-            parts = held if held and len(held[0]) >= len(parts[0]) else parts
-        block = _held_block(flight, parts, origin, told, control, warnings, seed, drift)
+        # Small matrices gain nothing by more threads, and their sums would depend on the machine.
+        with threadpool_limits(1, user_api="blas"):
+            block = _held_block(flight, parts, origin, told, control, warnings, seed)
         update(2, 2)
     return block
+
+
+def _sparse(database: Path, flight: Flight, guessed: Sequence[str], workdir: Path, seed: int) -> list[Bundle]:
+    """Sparse models as bundles, the largest first: with the focal lengths that the photos tell, if they tell them.
+
+    Over flat ground a focal length without limits may run away, and everything with it; it is let go only where not
+    all images could be placed with the one that is told.
+    """
+    names = [frame.name for frame in flight.frames]
+    numbers = {name: i for i, name in enumerate(names)}
+
+    def found(folder: Path, calibrate: bool) -> list[Bundle]:
+        models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
+        return [bundle_of(model, numbers) for model in models]
+
+    held = [] if guessed else found(workdir / "held", calibrate=False)
+    if held and len(held[0]) == len(names):
+        return held
+    free = found(workdir, calibrate=True)
+    return free if not held or (free and len(free[0]) > len(held[0])) else held
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
@@ -129,7 +144,6 @@ def _held_block(
     control: str,
     warnings: list[str],
     seed: int,
-    drift: float,
 ) -> Block:
     """The adjusted block, by what there is: GPS and controls, either, or the ground alone."""
     at = None
@@ -154,8 +168,7 @@ def _held_block(
         bundle = parts[0]
         # A scale near metres: the unit of a sparse model is arbitrary.
         result = adjusted_twice(bundle, held_by_images(bundle, flight.frames), flight.frames)
-    result = calibrated(result, drift > FOCAL_SUSPECT)
-    unsure = drift if focal_drift(result.bundle, flight.frames) < FOCAL_SUSPECT < drift else 0.0
+    result, untold = calibrated(result)
     ruled: Controlled | None = None
     if flight.gcps and control != "none":
         if at is None and (origin := control_origin(flight.gcps)) is not None:
@@ -169,11 +182,11 @@ def _held_block(
         bundle = result.bundle
         lift = by_ground(bundle.centres, bundle.points, bundle.world_from_camera, seed)
         result = replace(result, bundle=bundle.moved(lift))
-    if unsure and not (ruled is not None and ruled.used):
+    if untold and not (ruled is not None and ruled.used):
         warnings.append(
-            f"The focal length is that of the photos' data: by the images alone it would be {100 * unsure:.0f} % off, "
-            "and they do not clearly tell which is right. Differences in height may be wrong by as much: use ground "
-            "control, add images from another height, or give a calibrated camera."
+            f"The images do not tell the focal length: one that is {100 * FOCAL_TRIED:.0f} % longer would explain them "
+            "as well. Differences in height may be wrong by as much: use ground control, add images from another "
+            "height, or give a calibrated camera."
         )
     _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
     return _block(result, flight.frames, origin, metric, ruled, at is not None, apart, warnings)

@@ -22,8 +22,8 @@ NOISE_PX = 0.25
 WORST_PX = 3.0
 """Rays that miss their point by more are dropped."""
 
-FOCAL_SUSPECT = 0.03
-"""Share by which a focal length may differ from the photos' data before the images are mapped again with it held."""
+FOCAL_TRIED, TRIED_SIGMA = 0.05, 1e-4
+"""Share by which a focal length is made longer, to see whether the images notice; and how firmly that is held."""
 
 FOCAL_SIGMA = 0.02
 """Standard deviation of a focal length by the photo's own data, as a share."""
@@ -39,6 +39,9 @@ NO_LENS_SIGMA = 0.0001
 
 LOOSE = 10.0
 """Factor on the standard deviation of GPS until it has shown what it is worth."""
+
+HOPELESS, PATIENCE = 20, 5
+"""Steps that gain less than this part of what must be gained in all are the last ones after so many of them."""
 
 ROUGHLY = 1.0
 """What a step must still gain before the decisions; the last adjustment goes on to the end."""
@@ -81,7 +84,7 @@ def _shrunk(bundle: Bundle, frames: Sequence[Frame]) -> Array:
     return np.array(shrunk)[bundle.image]
 
 
-def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
+def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
     """Adjusted with the lens free, then without prior of the focal length, where the images clearly ask for it.
 
     Over level ground seen from one height they hardly tell a lens or a focal length from a bent block, and formal
@@ -90,23 +93,24 @@ def calibrated(result: Adjusted, drifted: bool) -> Adjusted:
 
     Args:
         result: with focal length and lens held.
-        drifted: whether the focal length may be another than the photos' data tell.
+
+    Returns:
+        The adjusted block, and whether the images leave its focal length open: one that is :data:`FOCAL_TRIED` longer
+        would cost less than that share.
     """
-    held = replace(result.held, lens_sigma=LENS_SIGMA)
-    lens = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
+    start = result.lever
+    lens = adjusted(result.bundle, replace(result.held, lens_sigma=LENS_SIGMA), lever=start, tolerance=ROUGHLY)
     if result.cost - lens.cost > GAIN * lens.cost:
         result = lens
-    if drifted and np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE:
-        held = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
-        focal = adjusted(result.bundle, held, lever=result.lever, tolerance=ROUGHLY)
-        result = focal if result.cost - focal.cost > GAIN * focal.cost else result
-    return adjusted(result.bundle, result.held, lever=result.lever)
-
-
-def focal_drift(bundle: Bundle, frames: Sequence[Frame]) -> float:
-    """How far the focal lengths are from the photos' own data at most, as a share."""
-    drift = 0.0
-    for j in range(len(bundle.lenses)):
-        prior = focal_px(frames[int(bundle.frames[np.flatnonzero(bundle.lens_of == j)[0]])])
-        drift = max(drift, 0.0 if not prior else abs(float(bundle.lenses[j, 0]) / prior - 1))
-    return drift
+    needed, untold = GAIN * result.cost, False
+    if np.isfinite(result.held.focals).all():
+        hopeless = needed / HOPELESS
+        longer = replace(result.held, focals=result.bundle.lenses[:, 0] * (1 + FOCAL_TRIED), focal_sigma=TRIED_SIGMA)
+        tried = adjusted(result.bundle, longer, lever=start, tolerance=hopeless, patience=PATIENCE)
+        untold = tried.cost - result.cost < needed
+        if np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE:
+            free_focal = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
+            focal = adjusted(result.bundle, free_focal, lever=start, tolerance=hopeless, patience=PATIENCE)
+            if result.cost - focal.cost > needed:
+                result, untold = focal, False
+    return adjusted(result.bundle, result.held, lever=result.lever), untold

@@ -130,6 +130,20 @@ def read_matches(path: Path, names: Sequence[str]) -> dict[tuple[int, int], NDAr
     return found
 
 
+def read_verified(path: Path, names: Sequence[str]) -> dict[tuple[int, int], NDArray[np.uint32]]:
+    """The matches that verification left, in the form of :func:`read_matches`."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as db:
+        index = {db.read_image_with_name(name).image_id: i for i, name in enumerate(names)}
+        found = {}
+        for pair, geometry in zip(*db.read_two_view_geometries(), strict=True):
+            i, j = (index[image] for image in pycolmap.pair_id_to_image_pair(pair))
+            rows = geometry.inlier_matches
+            found[min(i, j), max(i, j)] = rows if i < j else rows[:, ::-1]
+    return found
+
+
 def write_matches(
     path: Path,
     flight: Flight,

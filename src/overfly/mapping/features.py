@@ -14,7 +14,7 @@ from overfly.geometry import Array
 FEATURES = 5000
 LONGEST_SIDE = 1600
 NEIGHBOURS = 2
-"""Nearest frames in each of eight directions that a frame is matched with."""
+"""Nearest frames in each of eight directions that a frame may be matched with."""
 
 COARSE_FEATURES = 600
 COARSE_RATIO = 0.8
@@ -63,6 +63,7 @@ def image_pairs(
     positions: Array | None,
     descriptors: Sequence[NDArray[np.uint8]],
     progress: Callable[[int, int], None] | None = None,
+    neighbours: int = NEIGHBOURS,
 ) -> list[tuple[int, int]]:
     """Which frames to match, as sorted pairs i < j.
 
@@ -70,6 +71,7 @@ def image_pairs(
         positions: [n, 3] local GPS positions, NaN where a frame has none; None without GPS.
         descriptors: of n frames in the order of the flight, the coarsest first.
         progress: called with (coarse pairs compared, in all), where that is needed.
+        neighbours: nearest frames in each direction.
 
     Frames with GPS get the nearest others in each of eight directions, so that strips connect; frames without are
     compared with all others by their few hundred coarsest key points. Neighbours in time are always matched.
@@ -87,7 +89,7 @@ def image_pairs(
             sector = np.floor((np.arctan2(away[:, 1], away[:, 0]) / np.pi + 1) * 4).astype(int) % 8
             for s in range(8):
                 inside = np.flatnonzero((sector == s) & (places != i))
-                for j in places[inside[np.argsort(distance[inside], kind="stable")[:NEIGHBOURS]]]:
+                for j in places[inside[np.argsort(distance[inside], kind="stable")[:neighbours]]]:
                     pairs.add((int(min(i, j)), int(max(i, j))))
     blind = np.flatnonzero(~known).tolist()
     if blind:

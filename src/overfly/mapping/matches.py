@@ -15,7 +15,15 @@ from torch.nn import functional as F
 
 from overfly.flights import Flight, Frame
 from overfly.geometry import Array, Camera, pose, rotation_from_gimbal
-from overfly.mapping.database import focal_px, match_pairs, open_database, read_matches, write_matches
+from overfly.mapping.apart import cannot_overlap
+from overfly.mapping.database import (
+    focal_px,
+    match_pairs,
+    open_database,
+    read_matches,
+    read_verified,
+    write_matches,
+)
 from overfly.mapping.encoder_matches import Picture, Prior, match_pair, overlay, picture
 from overfly.mapping.features import MOST_PARTNERS, features, image_pairs
 from overfly.networks.encoder import Encoder
@@ -57,7 +65,7 @@ def matched(
         with bar("pairs", "images") as update:
             pairs = image_pairs(told, [descriptors for _, descriptors in found], update)
         with bar("matches", "pairs") as update:
-            match_pairs(database, [f.name for f in flight.frames], pairs, seed=seed, progress=update)
+            _match(database, flight, told, pairs, found, seed, update)
         if matcher == "sift":
             return database, guessed
         matches = read_matches(database, [f.name for f in flight.frames])
@@ -76,6 +84,32 @@ def matched(
     found = [(np.concatenate([own, others]), d) for (own, d), others in zip(found, pixels, strict=True)]
     database = workdir / f"matches_{matcher}.db"
     return database, write_matches(database, flight, found, matches, seed=seed)
+
+
+def _match(
+    database: Path,
+    flight: Flight,
+    told: Array | None,
+    pairs: Pairs,
+    found: Sequence[tuple[NDArray, NDArray]],
+    seed: int,
+    update: Callable[[int, int], None],
+) -> None:
+    """Match the nearest pairs, then of the others those that may see common ground by what these have shown."""
+    names = [frame.name for frame in flight.frames]
+    first = pairs if told is None else sorted(set(pairs) & set(image_pairs(told, [d for _, d in found], neighbours=1)))
+    match_pairs(database, names, first, seed=seed, progress=lambda done, _: update(done, len(pairs)))
+    if told is None:
+        return
+    verified = {
+        (i, j): (found[i][0][rows[:, 0]], found[j][0][rows[:, 1]])
+        for (i, j), rows in read_verified(database, names).items()
+    }
+    asked = sorted(set(pairs) - set(first))
+    apart = cannot_overlap(asked, told[:, :2], [(f.width, f.height) for f in flight.frames], verified)
+    rest = [pair for pair in asked if pair not in apart]
+    ready = len(pairs) - len(rest)
+    match_pairs(database, names, rest, seed=seed, progress=lambda done, _: update(ready + done, len(pairs)))
 
 
 def encoder_matches(

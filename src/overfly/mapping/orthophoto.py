@@ -124,12 +124,17 @@ class Orthophoto:
         steps = walls(heights, surface.cell, ground)
         canvas = Canvas(wide.rows, wide.columns)
         window, near = shapely.union_all([p.outline for p in parts]), EDGE * grid.cell
+        lifts = [p.base[2] - p.level for p in ground]  # from the grid's heights to the block's frame
+        known = heights[np.isfinite(heights)]
+        low, high = (known.min() + min(lifts), known.max() + max(lifts)) if known.size else (0.0, 0.0)
         for i in sorted(self._tree.query(window, predicate="dwithin", distance=near).tolist()):
             sight = self._sights[i]
             mine = [p for p in parts if sight.touches(p, near) and np.isfinite(fine[p.rows, p.columns]).any()]
             if mine:
-                around = [p for p in ground if sight.touches(p, near)]
-                stood = [w for w in steps if sight.touches(w.chunk, near)]
+                between = sight.between(shapely.union_all([p.outline for p in mine]), low, high)
+                aside = near + sight.coarseness(surface.cell)
+                around = [p for p in ground if shapely.dwithin(between, p.outline, aside)]
+                stood = [w for w in steps if shapely.dwithin(between, w.chunk.outline, aside)]
                 self._draw(i, wide.cell, fine, mine, sight.buffer(heights, surface.cell, around, stood), canvas)
         rgb, worth = canvas.blended()
         filled = fill(rgb, worth, fine, np.float32(STEP * surface.cell))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely import affinity
 
 from overfly.flights.footprint import border_pixels
 from overfly.geometry import Array, Camera, fold, rays
@@ -67,7 +68,8 @@ class Sight:
     Attributes:
         outline: polygon in x, y that holds all the ground the image can show, down to :data:`STEEPEST`.
         bounds: x_min, y_min, x_max, y_max of the image in ideal coordinates x/z, y/z.
-        near: height of the camera over the highest surface, at least a tenth of that over the lowest.
+        above: height of the camera over the lowest surface.
+        near: height of the camera over the highest surface, at least a tenth of ``above``.
         gsd: ground sampling distance straight down, half way between the two.
         steepest: tangent of the largest angle off the vertical at which it looks at the ground.
     """
@@ -79,7 +81,7 @@ class Sight:
         border = border[np.isfinite(border).all(1)]  # a strong barrel has no rays at its corners
         self.bounds = (*border[:, :2].min(0), *border[:, :2].max(0))
         above = self.pose[2, 3] - low
-        self.near = max(self.pose[2, 3] - high, 0.1 * above)
+        self.above, self.near = above, max(self.pose[2, 3] - high, 0.1 * above)
         world = border @ self.pose[:3, :3].T
         flat = np.maximum(np.linalg.norm(world[:, :2], axis=1, keepdims=True), 1e-12)
         # Rays to the horizon are bent down to the steepest angle, so that the outline stays a closed one.
@@ -92,6 +94,22 @@ class Sight:
     def touches(self, part: Chunk, margin: float) -> bool:
         """Whether the image can show anything of a chunk, or of its surroundings as far as ``margin``."""
         return bool(shapely.dwithin(self.outline, part.outline, margin))
+
+    def between(self, ground: shapely.Geometry, low: float, high: float) -> shapely.Geometry:
+        """What may stand between the camera and some ground: a polygon in x, y.
+
+        Args:
+            ground: in x, y.
+            low, high: heights between which that ground and all around it lie.
+        """
+        x, y = (float(c) for c in self.pose[:2, 3])
+        share = min((high - low) / max(self.pose[2, 3] - low, 1e-9), 1.0)  # of the way up to the camera
+        nearer = affinity.scale(ground, 1 - share, 1 - share, origin=(x, y))
+        return shapely.convex_hull(shapely.union_all([ground, nearer]))
+
+    def coarseness(self, cell: float) -> float:
+        """How far, on the ground, points decide of each other in a :meth:`buffer` of that cell: its pixel, then two."""
+        return 3 * FINENESS * cell * self.above / self.near
 
     def ideal(self, part: Chunk, x: Array, y: Array, z: Map) -> tuple[Map, Map, Map, Map]:
         """Ideal coordinates x/z, y/z, depth and squared tangent off the vertical of a chunk's points.
