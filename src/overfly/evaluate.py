@@ -26,8 +26,8 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     """Evaluate ``from_run`` and ``networks`` on the test and unseen flights of a configuration.
 
     Args:
-        cfg: with ``from_run``, ``networks`` (run folders or shipped networks by the name in the table), ``emd_windows``, ``every`` and
-            ``draws``.
+        cfg: with ``from_run``, ``networks`` (run folders or shipped networks by the name in the table),
+            ``emd_windows``, ``every`` and ``draws``.
         run_dir: gets evaluation.md, evaluation.csv and evaluation.png; with ``resume`` it goes on where it stopped.
 
     Returns:
