@@ -56,10 +56,10 @@ def test_what_is_held_fits_into_what_is_allowed() -> None:
 
 def test_only_what_cannot_fit_is_refused() -> None:
     least = least_gb([LARGE] * 2000, network=False)
-    check_memory(block(2000), MapSettings(dense="stereo", max_memory_gb=least + 0.01))
+    check_memory([LARGE] * 2000, MapSettings(dense="stereo", max_memory_gb=least + 0.01))
     with pytest.raises(InputError, match=r"at the least.*--max-memory 0\.2.*--size than 1600"):
-        check_memory(block(), MapSettings(dense="stereo", max_memory_gb=0.2))
-    check_memory(block(), MapSettings(dense="stereo"))  # nobody said how much: the smallest is tried
+        check_memory([LARGE] * 9, MapSettings(dense="stereo", max_memory_gb=0.2))
+    check_memory([LARGE] * 9, MapSettings(dense="stereo"))  # nobody said how much: the smallest is tried
 
 
 def test_what_nobody_said_follows_from_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ import pytest
 from overfly.cloud import Cloud
 from overfly.data.footprints import sees
 from overfly.geometry import Camera, pose, rotation_from_gimbal
+from overfly.mapping.facts import cloud_facts
 from overfly.mapping.gallery import gallery, upright, views_per_cell
 from overfly.mapping.oblique import oblique_view, splat
 from overfly.mapping.pictures import hillshade, jpeg, nice_length, overview, png, top_view
 from overfly.mapping.raster import Grid, Surface
+from overfly.mapping.tiles import write_tiles
 
 
 def town(n: int = 20_000) -> Cloud:
@@ -96,6 +99,21 @@ def test_gallery_has_every_picture_and_counts_views() -> None:
     row = seen.views[seen.grid.rows // 2]
     assert row[columns // 20] == 1  # x = 5 m: the first camera only
     assert row[columns // 2] == 2
+
+
+def test_ground_that_two_images_see_and_that_has_no_point_is_counted(tmp_path: Path) -> None:
+    camera = Camera.from_fov(400, 320, 90)
+    poses = np.stack([pose(rotation_from_gimbal(0, -90), [x, 40.0, 50.0]) for x in (40.0, 60.0)])
+    cloud = town()
+    hole = (np.abs(cloud.points[:, 0] - 50) < 10) & (np.abs(cloud.points[:, 1] - 40) < 10)
+    found = {}
+    for name, some in (("whole", cloud), ("torn", cloud[~hole])):
+        _, seen = gallery(some, [camera] * 2, poses, ["a.jpg", "b.jpg"], gsd=0.25, unit="m")
+        assert seen.views is not None
+        twice = np.count_nonzero(seen.views >= 2) * seen.grid.cell**2
+        found[name] = cloud_facts(write_tiles(tmp_path / name, [some]), some, seen, 0.25)["unmatched_share"]
+    assert found["whole"] < 0.02
+    assert found["torn"] == pytest.approx(400 / twice, rel=0.3)
 
 
 @pytest.mark.parametrize(

@@ -147,13 +147,15 @@ def test_files_read_back(tmp_path: Path, epsg: int | None) -> None:
     points = points[~((np.abs(points[:, 0] - 600_010) < 4) & (np.abs(points[:, 1] - 5_000_010) < 4))]
     colors = np.full((len(points), 3), (200, 100, 50), np.uint8)
     cloud = Cloud(points, colors, epsg=epsg)
-    raster_products(tiled(cloud, tmp_path / "tiles"), tmp_path, gsd=0.1)
+    raster_products(tiled(cloud, tmp_path / "tiles"), tmp_path, gsd=0.1034)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["dsm.tif", "orthophoto.tif", "tiles"]
     with rasterio.open(tmp_path / "dsm.tif") as dsm:
         assert (dsm.crs.to_epsg() if dsm.crs else None) == epsg
         assert dsm.nodata == NODATA
         assert dsm.profile["tiled"]
-        assert dsm.res[0] == pytest.approx(max(0.2, cell_size([cloud], 0.1)))
+        # Whole multiples of two digits of the GSD, counted from zero.
+        assert dsm.res[0] == pytest.approx(0.1 * round(cell_size([cloud], 0.1) / 0.1))
+        assert abs(np.remainder(dsm.transform.c / dsm.res[0] + 0.5, 1) - 0.5) < 1e-6
         values = [v[0] for v in dsm.sample([(600_035, 5_000_010), (600_020, 5_000_010), (600_010, 5_000_010)])]
         assert values == pytest.approx([12.0, 0.0, NODATA], abs=0.02)
     with rasterio.open(tmp_path / "orthophoto.tif") as photo:

@@ -31,7 +31,7 @@ def summary(**changes: Any) -> dict[str, Any]:
         "crs": "EPSG:32615", "cameras_from": "estimated", "seconds": {"cameras": 61.0, "dense": 130.5},
         "heights": "EPSG:5773",
         "metric": True, "peak_memory_mb": 2048.0, "warnings": [], "area": 12_345.0, "points_per_area": 100.0,
-        "height_range": [1.0, 9.0], "median_sigma": 0.03, "seen_once_share": 0.0, "reprojection_px": 0.61,
+        "height_range": [1.0, 9.0], "median_sigma": 0.03, "seen_once_share": 0.0, "unmatched_share": 0.0, "reprojection_px": 0.61,
         "unregistered": [], "skipped": {}, "gps_rms": {"horizontal_m": 0.4, "vertical_m": 0.2}, "reused": ["cameras"],
     }  # fmt: skip
     return base | changes
@@ -105,6 +105,7 @@ def test_every_caution_has_its_cause() -> None:
         "1 file was skipped: x.jpg": {"skipped": {"x.jpg": "truncated"}},
         "altitude is wrong": {"height_range": [-70.0, -60.0]},
         "12% of the mapped ground (1 481 m²) is seen by one image": {"seen_once_share": 0.12},
+        "41% of the ground that two images or more see has no point": {"unmatched_share": 0.41},
         "10% of the points are predicted": {"points": 100, "predicted": 10},
         "disagree with the images by 9.0 m": {"gps_rms": {"horizontal_m": 9.0, "vertical_m": None}},
         "no place on the Earth": {"crs": None, "cameras_from": "transforms.json"},

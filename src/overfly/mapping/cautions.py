@@ -115,6 +115,12 @@ def _about_points(summary: Mapping[str, Any]) -> Iterator[Caution]:
             "At the rim of a flight that is usual: leave it out, or fly one line and one image more around the area; "
             "within it fly with at least 60 % overlap along and across the lines.",
         )
+    if (blank := summary["unmatched_share"]) >= 0.15:
+        yield Caution(
+            f"{blank:.0%} of the ground that two images or more see has no point: nothing could be matched there.",
+            "Trees, water and smooth surfaces are like that; more overlap helps, and so does a larger --size where it "
+            "is smaller than the images.",
+        )
     if (share := summary["predicted"] / max(summary["points"], 1)) >= 0.02:
         yield Caution(
             f"{share:.0%} of the points are predicted, not measured.",

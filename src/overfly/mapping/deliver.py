@@ -26,7 +26,7 @@ from overfly.mapping.gains import Gains
 from overfly.mapping.gallery import gallery, upright
 from overfly.mapping.heights import heights_of
 from overfly.mapping.orthophoto import Orthophoto
-from overfly.mapping.products import SAMPLE, WINDOW, raster_products
+from overfly.mapping.products import SAMPLE, WINDOW, photo_overview, raster_products
 from overfly.mapping.raster import Grid, Surface
 from overfly.mapping.report import Caution, count_text, duration, write_report
 from overfly.mapping.rough_mesh import rough_mesh, without_spikes
@@ -103,6 +103,7 @@ def deliver(
             height_offset=float(np.median(few_placed.points[:, 2] - few.points[:, 2])),
             missing=list(block.gps_positions(lost_frames(flight, block)).items()),
             marks=marks_of(block) if level and block.cameras_from == "estimated" else None,
+            photo=photo_overview(out / "orthophoto.tif") if level else None,
         )
     summary = summarise(flight, block, cloud_facts(placed, few_placed, seen, gsd), few_placed.crs, asked, steps)
     summary["mesh"] = mesh
@@ -208,7 +209,8 @@ def summarise(
         "held_by_gps": block.held_by_gps,
         "unregistered": [frame.name for frame in lost_frames(flight, block)],
         "skipped": dict(flight.skipped),
-        **{k: counted[k] for k in ("area", "points_per_area", "height_range", "median_sigma", "seen_once_share")},
+        **{k: counted[k] for k in ("area", "points_per_area", "height_range", "median_sigma")},
+        **{k: counted[k] for k in ("seen_once_share", "unmatched_share")},
         "reused": steps.reused,
         "settings": asked.shown(),
         "version": __version__,

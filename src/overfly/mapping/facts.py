@@ -36,7 +36,7 @@ def cloud_facts(cloud: Tiles, sample: Cloud, seen: Surface, gsd: float) -> dict[
     Args:
         cloud: all points.
         sample: many of them, in the CRS of the product.
-        seen: the surface that areas are counted on.
+        seen: the surface that areas are counted on, with the number of frames that have each cell inside them.
         gsd: ground sampling distance.
     """
     area = float(np.count_nonzero(seen.filled)) * seen.grid.cell**2
@@ -50,6 +50,7 @@ def cloud_facts(cloud: Tiles, sample: Cloud, seen: Surface, gsd: float) -> dict[
         "height_range": [round(float(low), 3), round(float(high), 3)],
         "median_sigma": None if sample.sigma_m is None else round(float(np.median(sample.sigma_m)), 4),
         "seen_once_share": _share_once(seen),
+        "unmatched_share": _share_unmatched(seen),
         "gsd": gsd,
     }
 
@@ -59,6 +60,13 @@ def _share_once(seen: Surface) -> float:
     if seen.views is None or not seen.filled.any():
         return 0.0
     return round(float((seen.views[seen.filled] < 2).mean()), 4)
+
+
+def _share_unmatched(seen: Surface) -> float:
+    """Share of the ground within the map that two frames or more have inside them and that has no point."""
+    if seen.views is None or not (twice := seen.views >= 2).any():
+        return 0.0
+    return round(float((twice & ~seen.filled).sum() / twice.sum()), 4)
 
 
 def heights_above_ground(seen: Surface, poses: Array) -> NDArray[np.float64]:

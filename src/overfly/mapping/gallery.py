@@ -53,8 +53,11 @@ def gallery(
     height_offset: float = 0.0,
     missing: Sequence[tuple[str, NDArray]] = (),
     marks: Marks | None = None,
+    photo: NDArray[np.uint8] | None = None,
 ) -> tuple[list[Picture], Surface]:
     """All pictures of a report.
+
+    The surface has in ``views``, for every cell, how many frames have it inside them.
 
     Args:
         cloud: the map, in the same z-up frame as the poses (metres or units).
@@ -64,6 +67,7 @@ def gallery(
         height_offset: height of the product minus z here.
         missing: name and position [>=2] of frames that were not registered.
         marks: what holds the block, in the same frame.
+        photo: the orthophoto [rows, columns, 3], white where it is empty; None shows the colours of the points.
     """
     seen = pictures.overview(cloud, min_cell=2 * gsd)
     ground = float(np.nanmedian(seen.heights))
@@ -85,8 +89,9 @@ def gallery(
         Picture(
             "The map",
             "From above",
-            f"Colours of the cloud seen straight from above; {up}. White: nothing measured.",
-            pictures.jpeg(enlarged(pictures.top_view(seen))),
+            f"{'Colours of the cloud' if photo is None else 'The orthophoto'}, straight from above; {up}. White: nothing "
+            "measured.",
+            pictures.jpeg(enlarged(pictures.top_view(seen) if photo is None else photo)),
         ),
         Picture(
             "The map",
@@ -114,7 +119,7 @@ def gallery(
             "The flight",
             "Overlap",
             "How many images have a place inside their frame. Two are needed to measure, three make it reliable.",
-            pictures.png(pictures.views_map(seen.grid, views, unit=unit)),
+            pictures.png(pictures.views_map(seen.grid, np.where(seen.filled, views, np.nan), unit=unit)),
         ),
     ]
     if cloud.predicted is not None and cloud.predicted.any():
@@ -132,9 +137,15 @@ def enlarged(image: NDArray[np.uint8], pixels: int = 700) -> NDArray[np.uint8]:
 
 
 def views_per_cell(seen: Surface, cameras: Sequence[Camera], poses: Array) -> NDArray[np.float64]:
-    """Number of frames that have each cell of the surface inside them [rows, columns]; NaN where it is empty."""
-    count = np.full(seen.heights.shape, np.nan)
-    points = np.concatenate([seen.grid.centres(), seen.heights[..., None]], axis=-1)[seen.filled]
+    """Number of frames that have each cell of the surface inside them [rows, columns].
+
+    Empty cells are taken as high as the nearest one that is not.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    nearest = distance_transform_edt(~seen.filled, return_distances=False, return_indices=True)
+    heights = seen.heights[tuple(nearest)]
+    points = np.concatenate([seen.grid.centres(), heights[..., None]], axis=-1).reshape(-1, 3)
     total, groups = np.zeros(len(points)), Groups(points)
     for camera, pose in zip(cameras, poses, strict=True):
         # The lens bends what it sees: look for it as far as twice the image.
@@ -147,5 +158,4 @@ def views_per_cell(seen: Surface, cameras: Sequence[Camera], poses: Array) -> ND
         )
         near = groups.near(wide, pose)
         total[near] += sees(points[near], camera, pose)
-    count[seen.filled] = total
-    return count
+    return total.reshape(seen.heights.shape)

@@ -18,7 +18,7 @@ from overfly.geodesy import crs_code
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
 from overfly.mapping.heights import check_heights, check_place, with_heights
-from overfly.mapping.needs import Budget, allowed_gb, budget, least_gb
+from overfly.mapping.needs import Budget, Sizes, allowed_gb, budget, least_gb
 from overfly.mapping.report import count_text
 from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
@@ -44,6 +44,7 @@ def map_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -
         InputError: the flight cannot be mapped, or ``out`` belongs to another one.
     """
     flight, steps, identity, asked = _opened(flight_folder, out, settings)
+    check_memory([(frame.width, frame.height) for frame in flight.frames], asked)
     with _told_when_stopped(steps):
         block, key = _aligned(flight, identity, asked, steps)
         check_heights(block)
@@ -62,6 +63,7 @@ def align_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any)
 def measure_flight(flight_folder: Path | str, *, out: Path | str, **settings: Any) -> tuple[Flight, Block, Tiles]:
     """The flight, its cameras and the dense cloud in their frame, without products; arguments as :func:`map_flight`."""
     flight, steps, identity, asked = _opened(flight_folder, out, settings)
+    check_memory([(frame.width, frame.height) for frame in flight.frames], asked)
     with _told_when_stopped(steps):
         block, key = _aligned(flight, identity, asked, steps)
         return flight, block, _measured(flight, block, key, asked, steps)
@@ -124,7 +126,6 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
 
 def _measured(flight: Flight, block: Block, key: str, asked: MapSettings, steps: Steps) -> Tiles:
     """The dense cloud of a block, whose own key is given."""
-    check_memory(block, asked)
     network = _network_key(asked) if asked.dense == "sweep" else None
     key = key_of(key, DENSE_FORM, asked.dense, network, asked.seed, *([] if asked.size == SIZE else [asked.size]))
     make: Callable[[Path], Tiles] = {
@@ -136,13 +137,16 @@ def _measured(flight: Flight, block: Block, key: str, asked: MapSettings, steps:
     return local
 
 
-def check_memory(block: Block, asked: MapSettings) -> None:
+def check_memory(sizes: Sizes, asked: MapSettings) -> None:
     """Refuse before the work starts what would not fit, by the estimate of :mod:`overfly.mapping.needs`.
+
+    Args:
+        sizes: widths and heights of the images, pixels.
+        asked: the settings.
 
     Raises:
         InputError: more than ``max_memory_gb`` would be needed.
     """
-    sizes = [(camera.width, camera.height) for camera in block.cameras]
     needed = least_gb(sizes, asked.size, network=asked.dense == "sweep")
     if asked.max_memory_gb is not None and needed > asked.max_memory_gb:
         raise InputError(

@@ -74,10 +74,11 @@ def raster_products(
     Args:
         cloud: coloured points; their CRS becomes the files', the vertical one only the surface model's.
         out: folder.
-        gsd: ground sampling distance in the cloud's unit; see :func:`cell_size`.
+        gsd: ground sampling distance in the cloud's unit, of which two digits are used: the orthophoto's cells are
+            as large, the surface model's a whole multiple (see :func:`cell_size`).
         fill: passes that close gaps of single cells.
-        painter: colours the orthophoto, in cells of one GSD that divide the surface model's; None takes the mean
-            colours of the points, in the surface model's cells.
+        painter: colours the orthophoto, in cells of one GSD; None takes the mean colours of the points, in the
+            surface model's cells.
         window: cells computed at once, each way; what is written does not depend on it.
         sample: points by which the extent is told; twice as many tell the size of the cells.
 
@@ -90,7 +91,9 @@ def raster_products(
     if len(cloud) == 0:
         raise InputError("The cloud holds no points, so there is no surface to draw: check the overlap of the images.")
     few = cloud.sample(sample)
-    grid = grid_over(few.points, cell_size(cloud.some(2 * sample), gsd), trim=0.0005)
+    pixel = float(f"{gsd:.1e}")  # cells with a length that people can read, and that other maps of the place share
+    parts = round(cell_size(cloud.some(2 * sample), pixel) / pixel)
+    grid = grid_over(few.points, float(f"{parts * pixel:.12g}"), trim=0.0005)
     if grid.rows * grid.columns > max(MAX_CELLS, EMPTIEST * len(cloud)):
         raise InputError(
             f"The surface would have {grid.rows} x {grid.columns} cells of {grid.cell:.3g}: the cloud's extent "
@@ -104,9 +107,19 @@ def raster_products(
         else:
             _draw(cloud, grid, fill, window, heights, None)
         if painter is not None:
-            parts = max(1, round(grid.cell / gsd))
             _paint(heights, grid, painter, grid.cell / parts, photo, level, window)
     return grid
+
+
+def photo_overview(path: Path, *, longest: int = 1400) -> NDArray[np.uint8]:
+    """An orthophoto made small [rows, columns, 3], white where it is empty."""
+    import rasterio
+
+    with rasterio.open(path) as source:
+        factor = min(1.0, longest / max(source.width, source.height))
+        shape = max(1, round(source.height * factor)), max(1, round(source.width * factor))
+        *colors, alpha = source.read(out_shape=(4, *shape), resampling=rasterio.enums.Resampling.average)
+    return np.where(alpha[..., None] > 0, np.stack(colors, axis=-1), np.uint8(255))
 
 
 def cell_size(clouds: Sequence[Cloud], gsd: float) -> float:
