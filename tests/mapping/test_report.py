@@ -31,7 +31,8 @@ def summary(**changes: Any) -> dict[str, Any]:
         "crs": "EPSG:32615", "cameras_from": "estimated", "seconds": {"cameras": 61.0, "dense": 130.5},
         "heights": "EPSG:5773",
         "metric": True, "peak_memory_mb": 2048.0, "warnings": [], "area": 12_345.0, "points_per_area": 100.0,
-        "height_range": [1.0, 9.0], "median_sigma": 0.03, "seen_once_share": 0.0, "unmatched_share": 0.0, "reprojection_px": 0.61,
+        "height_range": [1.0, 9.0], "median_sigma": 0.03, "seen_once_share": 0.0, "unmatched_share": 0.0,
+        "reprojection_px": 0.61,
         "unregistered": [], "skipped": {}, "gps_rms": {"horizontal_m": 0.4, "vertical_m": 0.2}, "reused": ["cameras"],
     }  # fmt: skip
     return base | changes

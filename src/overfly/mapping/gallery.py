@@ -85,12 +85,12 @@ def gallery(
     else:
         taken += " (dots, joined in the order of the flight) and what they cover."
     up = "north is up" if unit == "m" else "the frame's y axis is up, where north is nobody knows"
+    of_what = "Colours of the cloud" if photo is None else "The orthophoto"
     shown = [
         Picture(
             "The map",
             "From above",
-            f"{'Colours of the cloud' if photo is None else 'The orthophoto'}, straight from above; {up}. White: nothing "
-            "measured.",
+            f"{of_what}, straight from above; {up}. White: nothing measured.",
             pictures.jpeg(enlarged(pictures.top_view(seen) if photo is None else photo)),
         ),
         Picture(
