@@ -43,6 +43,9 @@ GPS_2M = PoseNoise(horizontal_m=2.0, bias_horizontal_m=0.0, yaw_deg=1.0, tilt_de
 METHODS = ("sweep", "stereo", "pycolmap", "pycolmap_held", "ppg")
 SHOWN = {"fscore_1": "F-score at 1 m", "recall_1_interior": "recall at 1 m, interior", "core_seconds": "core-seconds"}
 STOCK = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from truth.stock import main; main()"
+LOST_PX = 1000.0
+"""Error of a point that comes to lie behind a camera."""
+
 Cameras = dict[str, tuple[Camera, Array]]
 
 
@@ -125,7 +128,8 @@ def camera_error(case: Case, found: Cameras) -> float | None:
 
     def misses(x: Array) -> Array:
         matrix = moved(x)
-        return np.concatenate([project(transform(matrix, p), *found[n])[0] - pixels for n, p, pixels in seen])
+        misses = np.concatenate([project(transform(matrix, p), *found[n])[0] - pixels for n, p, pixels in seen])
+        return np.nan_to_num(misses, nan=LOST_PX)
 
     best = least_squares(
         lambda x: misses(x).ravel(), np.zeros(7), x_scale=[1e-3] * 3 + [1.0] * 3 + [1e-3], loss="soft_l1"

@@ -14,15 +14,16 @@ from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array
 from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
-from overfly.mapping.bundle import Bundle, bundle_of
-from overfly.mapping.calibration import FOCAL_TRIED, adjusted_twice, calibrated, held_by_images
+from overfly.mapping.bundle import Bundle, bundle_of, components
+from overfly.mapping.by_priors import bundle_by_priors
+from overfly.mapping.calibration import FOCAL_TRIED, WORST_PX, adjusted_twice, calibrated, held_by_images
 from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
-from overfly.mapping.database import focal_px, strongest_pair
+from overfly.mapping.database import focal_px, read_points, read_verified, strongest_pair
 from overfly.mapping.georeference import by_ground
 from overfly.mapping.matches import Bar, matched
 from overfly.mapping.model import mapped
-from overfly.mapping.placing import UNKNOWN_M, placed
+from overfly.mapping.placing import UNKNOWN_M, agrees_with_gps, placed
 from overfly.mapping.survey import Precision
 from overfly.networks.encoder import Encoder
 
@@ -85,7 +86,7 @@ def align(
             "keep the photos' EXIF, or give a calibrated camera."
         )
     with bar("cameras", "models") as update:
-        parts = _sparse(database, flight, guessed, workdir, seed)
+        parts = _sparse(database, flight, guessed, told, workdir, seed)
         update(1, 2)
         if not parts:
             raise InputError(
@@ -99,11 +100,14 @@ def align(
     return block
 
 
-def _sparse(database: Path, flight: Flight, guessed: Sequence[str], workdir: Path, seed: int) -> list[Bundle]:
+def _sparse(
+    database: Path, flight: Flight, guessed: Sequence[str], told: Array | None, workdir: Path, seed: int
+) -> list[Bundle]:
     """Sparse models as bundles, the largest first: with the focal lengths that the photos tell, if they tell them.
 
     Over flat ground a focal length without limits may run away, and everything with it; it is let go only where not
-    all images could be placed with the one that is told.
+    all images could be placed with the one that is told. Where matches are so few that sparse mapping leaves images
+    out or contradicts GPS, cameras start where GPS and gimbals say that they are.
     """
     names = [frame.name for frame in flight.frames]
     numbers = {name: i for i, name in enumerate(names)}
@@ -112,11 +116,22 @@ def _sparse(database: Path, flight: Flight, guessed: Sequence[str], workdir: Pat
         models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
         return [bundle_of(model, numbers) for model in models]
 
-    held = [] if guessed else found(workdir / "held", calibrate=False)
-    if held and len(held[0]) == len(names):
-        return held
-    free = found(workdir, calibrate=True)
-    return free if not held or (free and len(free[0]) > len(held[0])) else held
+    best = [] if guessed else found(workdir / "held", calibrate=False)
+    if not (best and len(best[0]) == len(names)):
+        free = found(workdir, calibrate=True)
+        best = free if not best or (free and len(free[0]) > len(best[0])) else best
+    if told is None or (best and len(best[0]) == len(names) and agrees_with_gps(best[0], told)):
+        return best
+    features, lens_ids = read_points(database, names)
+    prior = bundle_by_priors(flight.frames, told, features, read_verified(database, names), lens_ids)
+    parts = [] if prior is None else components(prior)
+    return parts if parts and _weight(parts) > _weight(best) else best
+
+
+def _weight(parts: Sequence[Bundle]) -> tuple[int, int, int]:
+    """By which the better one of two sets of bundles is told: images of the largest, of all, and their good rays."""
+    rays = sum(int((part.errors() <= WORST_PX).sum()) for part in parts)
+    return max((len(part) for part in parts), default=0), sum(len(part) for part in parts), rays
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:

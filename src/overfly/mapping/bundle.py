@@ -95,6 +95,19 @@ class Bundle:
             pixels=self.pixels[good],
         )
 
+    def without(self, images: NDArray[np.bool_]) -> Bundle:
+        """Without some images [n] and what only they and one other see."""
+        kept = self.kept(~images[self.image])
+        number = np.cumsum(~images) - 1
+        return replace(
+            kept,
+            frames=self.frames[~images],
+            rotations=self.rotations[~images],
+            centres=self.centres[~images],
+            lens_of=self.lens_of[~images],
+            image=number[kept.image],
+        )
+
     def links(self) -> dict[tuple[int, int], int]:
         """How many points two images have in common, for pairs of images i < j that have any."""
         from scipy.sparse import csr_array
@@ -131,6 +144,18 @@ def bundle_of(model: Any, number: Mapping[str, int]) -> Bundle:
         point=place[first].astype(np.intp),
         pixels=rows[first, 2:],
     ).kept(np.ones(len(first), bool))
+
+
+def components(bundle: Bundle) -> list[Bundle]:
+    """Parts of a bundle that have no point in common, the largest first."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n, m = len(bundle), len(bundle.points)
+    joined = coo_array((np.ones(len(bundle.image)), (bundle.image, n + bundle.point)), shape=(n + m, n + m))
+    part = connected_components(joined, directed=False)[1][:n]
+    labels, sizes = np.unique(part, return_counts=True)
+    return [bundle.without(part != label) for label in labels[np.argsort(-sizes, kind="stable")]]
 
 
 def merged(parts: Sequence[Bundle]) -> Bundle:

@@ -31,6 +31,9 @@ FOCAL_SIGMA = 0.02
 FEWEST_TO_FREE = 8
 """Images of a camera from which on its focal length may be another than the photos' data tell: two lines of four."""
 
+FEWEST_RAYS_TO_FREE = 150
+"""Rays of its median image without which it stays: few wrong ones among few would move it."""
+
 GAIN = 0.01
 """Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
 
@@ -108,7 +111,8 @@ def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
         longer = replace(result.held, focals=result.bundle.lenses[:, 0] * (1 + FOCAL_TRIED), focal_sigma=TRIED_SIGMA)
         tried = adjusted(result.bundle, longer, lever=start, tolerance=hopeless, patience=PATIENCE)
         untold = tried.cost - result.cost < needed
-        if np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE:
+        rays = np.median(np.bincount(result.bundle.image, minlength=len(result.bundle)))
+        if np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE and rays >= FEWEST_RAYS_TO_FREE:
             free_focal = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
             focal = adjusted(result.bundle, free_focal, lever=start, tolerance=hopeless, patience=PATIENCE)
             if result.cost - focal.cost > needed:

@@ -144,6 +144,19 @@ def read_verified(path: Path, names: Sequence[str]) -> dict[tuple[int, int], NDA
     return found
 
 
+def read_points(path: Path, names: Sequence[str]) -> tuple[list[tuple[NDArray, NDArray]], list[int]]:
+    """Of each frame pixels [n, 2] and descriptors [n, d] of its key points, and what the database calls its camera."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as db:
+        images = [db.read_image_with_name(name) for name in names]
+        found = []
+        for image in images:
+            pixels = db.read_keypoints(image.image_id)[:, :2]
+            found.append((pixels, db.read_descriptors(image.image_id).data[: len(pixels)]))
+        return found, [image.camera_id for image in images]
+
+
 def write_matches(
     path: Path,
     flight: Flight,

@@ -25,8 +25,8 @@ SURE_THOUGH_SEEN = 0.7
 WIDEST = 2.0
 """Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
 
-ISLAND = 40
-"""Connected pieces of depth with fewer pixels are speckle."""
+SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.6
+"""Connected pieces of depth with fewer pixels are speckle; pieces up to the second size must correlate so well."""
 
 
 def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
@@ -41,9 +41,10 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     middle = float(np.median(depth[known])) if known.any() else 1.0
     unit = float(np.median((data["sigma"] / depth**2)[known])) if known.any() else 1.0
     steps = np.clip(np.where(known, (1 / np.where(known, depth, middle) - 1 / middle) / unit, -30000), -30000, 30000)
-    labels = steps.astype(np.int16)
-    cv2.filterSpeckles(labels, -30000, ISLAND, 8)
-    known &= labels > -30000
+    for size, score in ((SPECK, np.inf), (ISLAND, ISLAND_SCORE)):
+        labels = steps.astype(np.int16)
+        cv2.filterSpeckles(labels, -30000, size, 8)
+        known &= (labels > -30000) | (data["score"] >= score)
     depth = np.where(known, depth, np.float32(np.nan))
     opinion = depth_map.opinion()
     if opinion is None:

@@ -96,6 +96,16 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
     return Placed(bundle, places, sigmas, ups, apart=np.sort(numbers[len(done[0][0]) :]))
 
 
+def agrees_with_gps(bundle: Bundle, told: Array) -> bool:
+    """Whether a bundle, brought to the flight's GPS positions [n, 3] by a similarity, comes near to most of them."""
+    places = told[bundle.frames]
+    try:
+        moved = bundle.moved(by_gps(bundle.centres, places, [None] * len(bundle), bundle.world_from_camera))
+    except InputError:
+        return True
+    return float(np.nanmedian(np.linalg.norm((moved.centres - places)[:, :2], axis=1))) < FAR_OFF_M
+
+
 def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warnings: list[str]) -> Array:
     """GPS positions [n, 3] with what is wrong taken out: single positions, single heights, heights of wrong sign."""
     places = places.copy()

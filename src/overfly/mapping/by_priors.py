@@ -1,0 +1,188 @@
+"""A bundle that starts where GPS and gimbals say the cameras are: for flights with too few matches to be built up.
+
+Sparse mapping adds frame to frame, and each step needs many matches; what is known of all frames beforehand needs few.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from overfly.flights import Frame
+from overfly.geometry import Array, rotation_from_gimbal
+from overfly.mapping.adjustment import adjusted
+from overfly.mapping.bundle import Bundle, Index
+from overfly.mapping.calibration import LOOSE, ROUGHLY, held_by_images
+from overfly.mapping.database import focal_px
+from overfly.mapping.guided import guided_matches
+from overfly.mapping.placing import gps_sigmas
+
+FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
+"""What a ray is taken to be worth, pixels, one adjustment after another: at first directions are wrong by a degree."""
+
+REACH_PX, FAR_REACH_PX = 3.0, 40.0
+"""Off its epipolar line a key point is looked for so far, and so far if one of the images has no match yet."""
+
+WINDOWS_APART = 1.2
+"""Images are compared whose centres are nearer than so many times the ground that one sees, corner to corner."""
+
+RELIEF = (0.02, 0.98, 0.5)
+"""Shares of the points between whose heights the ground is looked for, and how much more, of their range, each way."""
+
+FEWEST_RAYS = 8
+"""Rays without which an image is not placed: three tell its pose, the others that they are right."""
+
+WORST_PX = 6.0
+"""Rays that miss their point by more at the end are dropped."""
+
+Features = tuple[NDArray, NDArray]
+Verified = Mapping[tuple[int, int], NDArray[np.uint32]]
+
+
+def bundle_by_priors(
+    frames: Sequence[Frame], told: Array, features: Sequence[Features], verified: Verified, lens_ids: Sequence[int]
+) -> Bundle | None:
+    """The frames with GPS, gimbal and focal length, adjusted to their matches; None where these do not fit.
+
+    What was matched without knowing anything is adjusted first. Then key points are matched again, only where they can
+    be (:mod:`overfly.mapping.guided`): that finds several times as many, also in images that had none.
+
+    Args:
+        frames: of the flight, n of them.
+        told: their GPS positions [n, 3] in local ENU metres, NaN where unknown.
+        features: pixels [p, 2] and descriptors [p, 128] of the key points of each frame.
+        verified: of pairs (i, j), rows of indices of their key points [m, 2].
+        lens_ids: what the database calls the camera of each frame.
+    """
+    known = [
+        i
+        for i, frame in enumerate(frames)
+        if np.isfinite(told[i]).all() and frame.gimbal is not None and focal_px(frame) is not None
+    ]
+    rank = {i: k for k, i in enumerate(known)}
+    rows = {(rank[i], rank[j]): r for (i, j), r in verified.items() if i in rank and j in rank and len(r)}
+    if len(known) < 2 or not rows:
+        return None
+    own = [features[i] for i in known]
+    ids = tuple(sorted({lens_ids[i] for i in known}))
+    first = [next(frames[i] for i in known if lens_ids[i] == lens) for lens in ids]
+    start = Bundle(
+        frames=np.array(known, np.intp),
+        rotations=np.stack([rotation_from_gimbal(*(frames[i].gimbal or (0, 0, 0))).T for i in known]),
+        centres=told[known],
+        lens_of=np.array([ids.index(lens_ids[i]) for i in known], np.intp),
+        lenses=np.array([[focal_px(f) or 0.0, f.width / 2, f.height / 2, 0.0, 0.0] for f in first]),
+        lens_ids=ids,
+        points=np.zeros((0, 3)),
+        image=np.zeros(0, np.intp),
+        point=np.zeros(0, np.intp),
+        pixels=np.zeros((0, 2)),
+    )
+    places, sigmas = told[known], gps_sigmas([frames[i] for i in known]) * LOOSE
+    bundle = _fitted(start, own, rows, frames, places, sigmas, FIRST_SIGMAS_PX)
+    if len(bundle.points) < FEWEST_RAYS:
+        return None
+    seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
+    shift = np.median((bundle.centres - start.centres)[seen], axis=0)
+    bundle = replace(
+        bundle,  # nothing held the others
+        rotations=np.where(seen[:, None, None], bundle.rotations, start.rotations),
+        centres=np.where(seen[:, None], bundle.centres, start.centres + shift),
+    )
+    bundle = _fitted(bundle, own, _more(bundle, own, rows), frames, places, sigmas, SIGMAS_PX)
+    while len(bundle) and (few := np.bincount(bundle.image, minlength=len(bundle)) < FEWEST_RAYS).any():
+        bundle = bundle.without(few)
+    return bundle if len(bundle) >= 2 else None
+
+
+def _fitted(
+    start: Bundle,
+    features: Sequence[Features],
+    rows: Verified,
+    frames: Sequence[Frame],
+    places: Array,
+    place_sigmas: Array,
+    sigmas_px: Sequence[float],
+) -> Bundle:
+    """Cameras adjusted to the tracks of matches, from where they are."""
+    image, point, at = _tracks([pixels for pixels, _ in features], rows)
+    points = np.zeros((point.max(initial=-1) + 1, 3))
+    bundle = _triangulated(replace(start, points=points, image=image, point=point, pixels=at))
+    for sigma in sigmas_px:
+        if len(bundle.points) < FEWEST_RAYS:
+            return bundle
+        held = replace(
+            held_by_images(bundle, frames),
+            pixel_sigma=np.full(len(bundle.image), sigma),
+            places=places,
+            place_sigmas=place_sigmas,
+            lens_fixed=np.ones(len(bundle.lenses), bool),
+        )
+        bundle = adjusted(bundle, held, tolerance=ROUGHLY).bundle
+        bundle = bundle.kept(bundle.errors() < max(WORST_PX, 4 * sigma))
+    return bundle.kept(bundle.errors() < WORST_PX)
+
+
+def _more(bundle: Bundle, features: Sequence[Features], rows: Verified) -> Verified:
+    """The matches and those that the cameras' poses lead to."""
+    least, most, more = RELIEF
+    low, high = np.quantile(bundle.points[:, 2], [least, most])
+    heights = float(low - more * (high - low)), float(high + more * (high - low))
+    seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
+    corner = np.linalg.norm(bundle.lenses[bundle.lens_of, 1:3], axis=1) / bundle.lenses[bundle.lens_of, 0]
+    shown = 2 * corner * np.maximum(bundle.centres[:, 2] - low, 0)
+    found = dict(rows)
+    for i in range(len(bundle)):
+        for j in range(i + 1, len(bundle)):
+            if np.linalg.norm((bundle.centres[i] - bundle.centres[j])[:2]) < WINDOWS_APART * max(shown[i], shown[j]):
+                reach = REACH_PX if seen[i] and seen[j] else FAR_REACH_PX
+                pixels, descriptors = zip(features[i], features[j], strict=True)
+                new = guided_matches(bundle, (i, j), pixels, descriptors, heights, reach)
+                if len(new):
+                    found[i, j] = np.unique(np.concatenate([rows.get((i, j), new[:0]), new]), axis=0)
+    return found
+
+
+def _tracks(pixels: Sequence[NDArray], rows: Verified) -> tuple[Index, Index, Array]:
+    """Key points that matches join: image [k], point [k] and pixels [k, 2] of each, ordered by point.
+
+    A track that comes to two places of one image is wrong and left out.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    starts = np.cumsum([0, *(len(p) for p in pixels)])
+    ends = [np.concatenate([starts[pair[side]] + r[:, side] for pair, r in rows.items()]) for side in (0, 1)]
+    joined = coo_array((np.ones(len(ends[0])), tuple(ends)), shape=(starts[-1], starts[-1]))
+    _, track = connected_components(joined, directed=False)
+    used = np.unique(np.concatenate(ends))
+    image = np.searchsorted(starts, used, side="right") - 1
+    _, owner, count = np.unique(track[used] * len(pixels) + image, return_inverse=True, return_counts=True)
+    torn = np.unique(track[used][count[owner.reshape(-1)] > 1])
+    good = ~np.isin(track[used], torn)
+    used, image = used[good], image[good]
+    point = np.unique(track[used], return_inverse=True)[1].reshape(-1)
+    order = np.lexsort((image, point))
+    return image[order], point[order], np.concatenate(pixels)[used[order]].astype(float)
+
+
+def _triangulated(bundle: Bundle) -> Bundle:
+    """With each point nearest to its rays, without those that lie behind a camera or where rays are parallel."""
+    f, cx, cy = bundle.lenses[bundle.lens_of[bundle.image]].T[:3]
+    flat = (bundle.pixels - np.stack([cx, cy], axis=1)) / f[:, None]
+    local = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    rays = np.einsum("kji,kj->ki", bundle.rotations[bundle.image], local)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    m = len(bundle.points)
+    normal, right = np.zeros((m, 3, 3)), np.zeros((m, 3))
+    np.add.at(normal, bundle.point, across)
+    np.add.at(right, bundle.point, np.einsum("kij,kj->ki", across, bundle.centres[bundle.image]))
+    firm = np.linalg.eigvalsh(normal)[:, 0] > 1e-4
+    points = np.zeros((m, 3))
+    points[firm] = np.linalg.solve(normal[firm], right[firm][:, :, None])[:, :, 0]
+    placed = replace(bundle, points=points)
+    return placed.kept(firm[bundle.point] & np.isfinite(placed.errors()))

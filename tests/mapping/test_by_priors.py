@@ -1,0 +1,140 @@
+"""Cameras that start where GPS and gimbals say, on matches too few to build a model from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from overfly.flights import Frame
+from overfly.geometry import Array, Camera, fit_similarity, pose, project, rotation_from_gimbal
+from overfly.mapping.bundle import Bundle, components
+from overfly.mapping.by_priors import bundle_by_priors
+from overfly.mapping.guided import guided_matches
+
+CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
+SHOWN = 250
+"""Key points of a frame."""
+
+
+class Block:
+    """Two lines of four frames at 100 m over rough ground; every ground point has a descriptor of its own."""
+
+    def __init__(self, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.places = np.array([(60.0 * (k // 4), 45.0 * (k % 4), 100.0) for k in range(8)])
+        self.yaws = np.where(np.arange(8) < 4, 0.0, 180.0)
+        self.poses = np.stack(
+            [pose(rotation_from_gimbal(yaw, -90), place) for yaw, place in zip(self.yaws, self.places, strict=True)]
+        )
+        self.ground = np.column_stack([rng.uniform(-80, 220, (2500, 2)), rng.uniform(0, 8, 2500)])
+        looks = rng.integers(0, 80, (2500, 128)).astype(np.uint8)
+        self.features, self.seen = [], []
+        for matrix in self.poses:
+            pixels, depth = project(self.ground, CAMERA, matrix)
+            inside = np.flatnonzero((depth > 0) & ((pixels > 0) & (pixels < (800, 600))).all(1))
+            shown = rng.permutation(inside)[:SHOWN]
+            self.seen.append(shown)
+            noisy = pixels[shown] + rng.normal(0, 0.2, (len(shown), 2))
+            self.features.append((noisy, np.clip(looks[shown] + rng.integers(0, 4, (len(shown), 128)), 0, 255)))
+        # Priors: GPS off by 2 m, all headings by 2 degrees and each by half a degree.
+        self.told = self.places + rng.normal(0, 2, (8, 3))
+        self.frames = [
+            Frame(f"{k}.jpg", Path(f"{k}.jpg"), 800, 600, focal_px=600.0, gimbal=(float(yaw), -89.7, 0.0))
+            for k, yaw in enumerate(self.yaws + 2 + rng.normal(0, 0.5, 8))
+        ]
+
+    def common(self, most: int, without: int = -1) -> dict[tuple[int, int], np.ndarray]:
+        """Right matches, at most so many of a pair, none of one frame."""
+        found = {}
+        for i in range(8):
+            for j in range(i + 1, 8):
+                both = np.intersect1d(self.seen[i], self.seen[j], return_indices=True)
+                if len(both[0]) >= 3 and without not in (i, j):
+                    found[i, j] = np.column_stack(both[1:])[:most].astype(np.uint32)
+        return found
+
+
+def misses(block: Block, bundle: Bundle) -> float:
+    """How far off, pixels, the cameras see the ground, median after the best similarity of their centres."""
+    matrix = fit_similarity(bundle.centres, block.places[bundle.frames])
+    moved = bundle.moved(matrix)
+    off: list[Array] = []
+    for k, i in enumerate(bundle.frames.tolist()):
+        points = block.ground[block.seen[i]]
+        found, true = (project(points, CAMERA, matrix)[0] for matrix in (moved.pose(k), block.poses[i]))
+        off.append(np.linalg.norm(found - true, axis=1))
+    return float(np.median(np.concatenate(off)))
+
+
+def test_few_matches_and_priors_make_a_block_with_every_frame() -> None:
+    """A frame that nothing was matched with is found by looking where it must be."""
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12, without=5), [1] * 8)
+    assert found is not None
+    assert found.frames.tolist() == list(range(8))
+    assert np.bincount(found.image).min() >= 20
+    assert np.median(found.errors()) < 0.5
+    assert misses(block, found) < 6  # GPS alone: the test below
+    assert found.lenses[0, 0] == pytest.approx(600, rel=1e-6)
+
+
+def test_the_images_correct_what_gps_and_gimbals_say() -> None:
+    block = Block(1)
+    rotations = np.stack([rotation_from_gimbal(*(f.gimbal or (0, 0, 0))).T for f in block.frames])
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    off = [misses(block, bundle) for bundle in (found, Bundle(
+        np.arange(8), rotations, block.told, np.zeros(8, np.intp), found.lenses, (1,), np.zeros((0, 3)),
+        np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 2)),
+    ))]  # fmt: skip
+    assert off[0] < off[1] / 2
+
+
+@pytest.mark.parametrize("lacking", ["gimbal", "gps", "matches"])
+def test_without_priors_or_matches_there_is_no_block(lacking: str) -> None:
+    from dataclasses import replace
+
+    block = Block()
+    frames = [replace(f, gimbal=None) for f in block.frames] if lacking == "gimbal" else block.frames
+    told = np.full_like(block.told, np.nan) if lacking == "gps" else block.told
+    matches = {} if lacking == "matches" else block.common(12)
+    assert bundle_by_priors(frames, told, block.features, matches, [1] * 8) is None
+
+
+def test_guided_matches_are_the_right_ones() -> None:
+    block = Block()
+    exact = Bundle(
+        np.arange(8), np.linalg.inv(block.poses[:, :3, :3]), block.places, np.zeros(8, np.intp),
+        np.array([[600.0, 400, 300, 0, 0]]), (1,), np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp),
+        np.zeros((0, 2)),
+    )  # fmt: skip
+    pixels, descriptors = zip(block.features[0], block.features[1], strict=True)
+    rows = guided_matches(exact, (0, 1), pixels, descriptors, (-1.0, 9.0), 3.0)
+    common = len(np.intersect1d(block.seen[0], block.seen[1]))
+    assert (block.seen[0][rows[:, 0]] == block.seen[1][rows[:, 1]]).mean() > 0.97
+    assert len(rows) > 0.8 * common
+    far = exact.moved(np.eye(4))
+    far.centres[1] += [5000, 0, 0]
+    assert len(guided_matches(far, (0, 1), pixels, descriptors, (-1.0, 9.0), 3.0)) == 0
+
+
+def test_parts_without_common_points_are_told_apart() -> None:
+    block = Block()
+    matches = {(i, j): rows for (i, j), rows in block.common(12).items() if (i < 3) == (j < 3)}
+    blank = [(pixels, np.zeros_like(looks)) for pixels, looks in block.features]
+    found = bundle_by_priors(block.frames, block.told, blank, matches, [1] * 8)
+    assert found is not None
+    assert [part.frames.tolist() for part in components(found)] == [[3, 4, 5, 6, 7], [0, 1, 2]]
+
+
+def test_a_bundle_without_an_image() -> None:
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    rest = found.without(np.arange(8) == 2)
+    assert rest.frames.tolist() == [0, 1, 3, 4, 5, 6, 7]
+    assert np.bincount(rest.point).min() >= 2
+    np.testing.assert_array_equal(rest.centres, np.delete(found.centres, 2, 0))
+    assert np.median(rest.errors()) < 0.5
