@@ -16,8 +16,11 @@ from overfly.mapping.subpixel import Map, frame_to_frame
 GATE = 3.0
 """Two depths of one place agree within this many standard deviations of their difference."""
 
-WORST_SCORE = {True: 0.2, False: 0.45}
+WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
+
+SEEN_BY_MANY, WORST_OF_ONE_PAIR = 2, 0.45
+"""Where so many partners have the place inside and only one pair has matched it, it must correlate as well as that."""
 
 SURE_THOUGH_SEEN = 0.7
 """Confidence from which on a network's word alone stands where other frames have the place inside and match nothing."""
@@ -25,7 +28,7 @@ SURE_THOUGH_SEEN = 0.7
 WIDEST = 2.0
 """Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
 
-SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.6
+SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.7
 """Connected pieces of depth with fewer pixels are speckle; pieces up to the second size must correlate so well."""
 
 
@@ -41,9 +44,9 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     middle = float(np.median(depth[known])) if known.any() else 1.0
     unit = float(np.median((data["sigma"] / depth**2)[known])) if known.any() else 1.0
     steps = np.clip(np.where(known, (1 / np.where(known, depth, middle) - 1 / middle) / unit, -30000), -30000, 30000)
-    for size, score in ((SPECK, np.inf), (ISLAND, ISLAND_SCORE)):
+    for pixels, score in ((SPECK, np.inf), (ISLAND, ISLAND_SCORE)):
         labels = steps.astype(np.int16)
-        cv2.filterSpeckles(labels, -30000, size, 8)
+        cv2.filterSpeckles(labels, -30000, pixels, 8)
         known &= (labels > -30000) | (data["score"] >= score)
     depth = np.where(known, depth, np.float32(np.nan))
     opinion = depth_map.opinion()
@@ -96,8 +99,10 @@ def frame_points(
     total, mean = weight.copy(), weight * depth
     agree = np.zeros(depth.shape, np.uint8)
     taken = np.zeros(depth.shape, bool)
+    visible = np.zeros(depth.shape, np.uint8)
     for partner, other, before in partners:
-        found, spread, given, theirs = _look_up(own, depth, partner, other, before)
+        found, spread, given, theirs, inside = _look_up(own, depth, partner, other, before)
+        visible += inside
         # What pairs have matched is judged by what pairs have matched alone: the cloud of them is that of stereo.
         found = np.where(theirs & ~second, np.float32(np.nan), found)
         with np.errstate(invalid="ignore"):
@@ -111,6 +116,7 @@ def frame_points(
     # One pair alone must at least agree with itself, seen from its other frame.
     votes = np.maximum(agree, data["support"])
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
+    known &= guessed | (visible < SEEN_BY_MANY) | (data["support"] >= 2) | (data["score"] >= WORST_OF_ONE_PAIR)
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
         alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN)
@@ -141,9 +147,9 @@ def frame_points(
 
 def _look_up(
     own: DepthMap, depth: Map, other: DepthMap, data: Mapping[str, NDArray], given: NDArray[np.bool_] | None
-) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_]]:
-    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given, and
-    whether no pair has matched it there."""
+) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given,
+    whether no pair has matched it there, and whether it lies inside that map at all."""
     import cv2
 
     q, t = frame_to_frame(own.camera, own.world_from_camera, other.camera, other.world_from_camera)
@@ -164,7 +170,8 @@ def _look_up(
         for mask in (given, data.get("second"))
     )
     # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
-    return there / third, spread / third, was, theirs
+    inside = (u > -0.5) & (v > -0.5) & (u < other.camera.width - 0.5) & (v < other.camera.height - 0.5)
+    return there / third, spread / third, was, theirs, inside
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
