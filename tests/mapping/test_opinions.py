@@ -180,3 +180,19 @@ def test_no_point_comes_from_where_the_lens_has_shown_nothing(camera: Camera, tm
     assert 0.3 * camera.width * camera.height < len(cloud) < 0.98 * camera.width * camera.height
     assert cloud.colors is not None
     assert cloud.colors.min() > 190
+
+
+@pytest.mark.parametrize(("partners", "score", "kept"), [(1, 0.35, True), (2, 0.35, False), (2, 0.5, True)])
+def test_a_pair_alone_must_correlate_better_where_more_partners_see_the_place(
+    camera: Camera, partners: int, score: float, kept: bool, tmp_path: Path
+) -> None:
+    shape = camera.height, camera.width
+    blank = {"sigma": np.full(shape, 0.1, np.float32), "support": np.ones(shape, np.uint8)}
+    data = blank | {"depth": np.full(shape, 50, np.float32), "score": np.full(shape, score, np.float32)}
+    empty = blank | {"depth": np.full(shape, np.nan, np.float32)}  # sees the place and has matched nothing there
+    own, other = (DepthMap(name, camera, np.eye(4), [], tmp_path / f"{name}.npz") for name in ("a", "b"))
+    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
+    Image.fromarray(np.full((*shape, 3), 200, np.uint8)).save(frame.path)
+    near = [(other, data, None), *[(other, empty, None)] * (partners - 1)]
+    cloud, *_ = frame_points(own, data, near, frame, single=True)
+    assert len(cloud) == (camera.width * camera.height if kept else 0)
