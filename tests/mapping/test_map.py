@@ -354,6 +354,8 @@ def test_a_mesh_is_written_beside_the_other_products(tmp_path: Path) -> None:
     assert facts["crs"] == summary["crs"] == "EPSG:32615"
     assert facts["faces"] == pytest.approx(1000, rel=0.2)
     assert facts["textured_share"] > 0.7
+    assert 0 <= facts["filled_share"] < 0.5
+    assert f"{facts['filled_share']:.0%} of its plan closes gaps" in (out / "report.html").read_text()
     assert summary["settings"]["mesh_faces"] == 1000
     report = (out / "report.html").read_text()
     assert "mesh.glb" in report

@@ -7,7 +7,7 @@ import pytest
 
 from overfly.cloud import Cloud
 from overfly.errors import InputError
-from overfly.mapping.rough_mesh import FILL, cell_of, rough_mesh, without_spikes
+from overfly.mapping.rough_mesh import FILL, cell_of, filled_share, rough_mesh, without_spikes
 from overfly.mesh import Mesh
 from overfly.rendering import topology
 
@@ -39,6 +39,14 @@ def test_the_budget_is_kept_where_the_cloud_covers_only_a_part_of_its_grid(faces
     points = box_on_plane().points
     strip = Cloud(points[np.abs(points[:, 0] - points[:, 1]) < 10])
     assert len(rough_mesh(strip, faces=faces).faces) == pytest.approx(faces, rel=0.1)
+
+
+def test_what_only_closes_a_gap_is_told() -> None:
+    cloud = box_on_plane()
+    away = np.abs(cloud.points[:, :2] - [-20, -20]).max(1)
+    torn = cloud[away > 5]
+    assert filled_share(rough_mesh(cloud, faces=9000), cloud) < 0.01
+    assert filled_share(rough_mesh(torn, faces=9000), torn) == pytest.approx(100 / 3600, rel=0.35)
 
 
 def test_roof_and_ground_have_their_heights_and_nothing_lies_between() -> None:

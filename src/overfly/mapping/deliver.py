@@ -29,7 +29,7 @@ from overfly.mapping.orthophoto import Orthophoto
 from overfly.mapping.products import SAMPLE, WINDOW, photo_overview, raster_products
 from overfly.mapping.raster import Grid, Surface
 from overfly.mapping.report import Caution, count_text, duration, write_report
-from overfly.mapping.rough_mesh import rough_mesh, without_spikes
+from overfly.mapping.rough_mesh import filled_share, rough_mesh, without_spikes
 from overfly.mapping.settings import MESH_FACES, MapSettings
 from overfly.mapping.steps import Steps, peak_memory_mb
 from overfly.mapping.tiles import Tiles
@@ -154,9 +154,10 @@ def _mesh(
         found.append(Caution(what, advice))
     placed = georeferenced(few[:0], block)
     try:
+        mesh = without_spikes(rough_mesh(Cloud(few.points, few.colors), faces=faces))
         made = write_textured_mesh(
             path,
-            without_spikes(rough_mesh(Cloud(few.points, few.colors), faces=faces)),
+            mesh,
             views,
             gains,
             place=lambda points: georeferenced(Cloud(points), block).points,
@@ -165,6 +166,7 @@ def _mesh(
         )
     except InputError as error:
         return None, [*found, Caution("There is no mesh.glb.", str(error))]
+    made["filled_share"] = round(filled_share(mesh, few), 4)
     steps.say("mesh", f"{count_text(made['faces'])} triangles, {made['textured_share']:.0%} textured by photographs")
     return made, found
 

@@ -241,7 +241,8 @@ def _about_mesh(summary: Mapping[str, Any], name: str) -> str:
     x, y, z = (f"{value:.0f}" for value in mesh["origin"])
     return (
         f"; {count_text(mesh['faces'])} triangles; {mesh['textured_share']:.0%} of the surface shows photographs, "
-        f"the rest the cloud's colours; its origin is {x}, {y}, {z}"
+        f"the rest the cloud's colours; {mesh['filled_share']:.0%} of its plan closes gaps without points; its origin "
+        f"is {x}, {y}, {z}"
     )
 
 

@@ -62,6 +62,23 @@ def rough_mesh(cloud: Cloud, *, faces: int) -> Mesh:
     return mesh
 
 
+def filled_share(mesh: Mesh, cloud: Cloud) -> float:
+    """Share of a height field's plan that only closes gaps: faces with no point near their middle, seen from above.
+
+    Args:
+        mesh: of :func:`rough_mesh`.
+        cloud: it was made from.
+    """
+    from scipy.spatial import cKDTree
+
+    corners = mesh.vertices[mesh.faces][:, :, :2]
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    plan = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
+    near = np.sqrt(2 * float(np.median(plan)))  # a cell: each holds two faces
+    away, _ = cKDTree(cloud.points[:, :2]).query(corners.mean(1), distance_upper_bound=near)
+    return float(plan[~np.isfinite(away)].sum() / plan.sum())
+
+
 def _triangulated(cloud: Cloud, grid: Grid) -> Mesh:
     heights, colors = _medians(cloud, grid)
     known = np.isfinite(heights)
