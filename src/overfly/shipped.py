@@ -35,7 +35,7 @@ def load_network(name: str | None = None) -> Run:
         return _load(WEIGHTS / f"{name}.safetensors")
     if not Path(name).exists():
         raise InputError(
-            f"--network {name} is neither a shipped network ({', '.join(names()) or 'none'}) nor a run folder: "
+            f"The network {name} is neither a shipped network ({', '.join(names()) or 'none'}) nor a run folder: "
             "give one of these, or a folder that train.py wrote."
         )
     return load_run(name)

@@ -73,3 +73,16 @@ def test_frames_without_partners_or_positions_are_kept(block: tuple[Array, list[
     assert not cannot_overlap([(0, 4)], places, [SIZE] * 15, {})
     few = {pair: (a[:5], b[:5]) for pair, (a, b) in matched.items()}
     assert not cannot_overlap([(0, 14)], places, [SIZE] * 15, few)
+
+
+def test_copies_of_a_photo_spoil_nothing(block: tuple[Array, list[float]]) -> None:
+    """Two images with all points in common from one place tell no scale."""
+    places, headings = block
+    rng = np.random.default_rng(3)
+    matched = common(places, headings, rng)
+    same = rng.uniform(0, 600, (100, 2))
+    apart = [(0, 4), (0, 14)]
+    twice = np.concatenate([places, [[5000.0, 5000.0], [5000.0, 5000.0]]])
+    assert not cannot_overlap(apart, twice, [SIZE] * 17, {(15, 16): (same, same)})
+    found = cannot_overlap([*apart, (15, 16)], twice, [SIZE] * 17, matched | {(15, 16): (same, same)})
+    assert (15, 16) not in found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,8 +95,6 @@ def test_the_images_correct_what_gps_and_gimbals_say() -> None:
 
 @pytest.mark.parametrize("lacking", ["gimbal", "gps", "matches"])
 def test_without_priors_or_matches_there_is_no_block(lacking: str) -> None:
-    from dataclasses import replace
-
     block = Block()
     frames = [replace(f, gimbal=None) for f in block.frames] if lacking == "gimbal" else block.frames
     told = np.full_like(block.told, np.nan) if lacking == "gps" else block.told
@@ -118,6 +117,33 @@ def test_guided_matches_are_the_right_ones() -> None:
     far = exact.moved(np.eye(4))
     far.centres[1] += [5000, 0, 0]
     assert len(guided_matches(far, (0, 1), pixels, descriptors, (-1.0, 9.0), 3.0)) == 0
+
+
+def test_key_points_without_descriptors_and_a_camera_of_its_own() -> None:
+    """Those of a network follow SIFT's; and a lens goes with the last image that has it."""
+    block = Block()
+    more = [(np.concatenate([pixels, pixels[:40] + 0.3]), looks) for pixels, looks in block.features]
+    found = bundle_by_priors(block.frames, block.told, more, block.common(12), [1, 1, 1, 1, 1, 2, 1, 1])
+    assert found is not None
+    assert len(found.lenses) == 2
+    rest = found.without(np.arange(8) == 5)
+    assert rest.lens_ids == (1,)
+    assert len(rest.lenses) == 1
+    assert (rest.lens_of == 0).all()
+    (whole,) = components(rest)
+    assert whole.camera(0, 800, 600).fx == pytest.approx(600, rel=1e-6)
+
+
+@pytest.mark.parametrize("times", [1, 5])
+def test_larger_images_are_placed_as_well(times: int) -> None:
+    block = Block()
+    for k, (pixels, looks) in enumerate(block.features):
+        block.features[k] = (pixels * times, looks)
+        frame = block.frames[k]
+        block.frames[k] = replace(frame, width=800 * times, height=600 * times, focal_px=600.0 * times)
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12, without=5), [1] * 8)
+    assert found is not None
+    assert np.bincount(found.image).min() >= 100
 
 
 def test_parts_without_common_points_are_told_apart() -> None:

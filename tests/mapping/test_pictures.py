@@ -113,6 +113,10 @@ def test_ground_that_two_images_see_and_that_has_no_point_is_counted(tmp_path: P
         twice = np.count_nonzero(seen.views >= 2) * seen.grid.cell**2
         found[name] = cloud_facts(write_tiles(tmp_path / name, [some]), some, seen, 0.25)["unmatched_share"]
     assert found["whole"] < 0.02
+    # What lies in the bend of an L is not within the map.
+    bend = (cloud.points[:, 0] > 50) & (cloud.points[:, 1] > 40)
+    _, seen = gallery(cloud[~bend], [camera] * 2, poses, ["a.jpg", "b.jpg"], gsd=0.25, unit="m")
+    assert cloud_facts(write_tiles(tmp_path / "bent", [cloud]), cloud, seen, 0.25)["unmatched_share"] < 0.1
     assert found["torn"] == pytest.approx(400 / twice, rel=0.3)
 
 

@@ -16,7 +16,7 @@ from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
 from overfly.mapping.bundle import Bundle, bundle_of, components
 from overfly.mapping.by_priors import bundle_by_priors
-from overfly.mapping.calibration import FOCAL_TRIED, WORST_PX, adjusted_twice, calibrated, held_by_images
+from overfly.mapping.calibration import FOCAL_TRIED, adjusted_twice, calibrated, held_by_images
 from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, read_points, read_verified, strongest_pair
@@ -32,6 +32,12 @@ FEWEST_TO_JUDGE, UNJUDGED_M = 4, 1.5
 
 SCALE_UNSURE = 0.04
 """Standard deviation of the scale by GPS, as a share, from which on it is told."""
+
+ENOUGH = 0.95
+"""Share of the images that sparse mapping must place, or their priors are tried as well."""
+
+WORSE = 2.0
+"""Times by which reprojection errors may be larger where more images are placed."""
 
 FOCAL_DRIFT = 0.1
 """Share by which a focal length may differ from the photos' data before this is said."""
@@ -86,14 +92,15 @@ def align(
             "keep the photos' EXIF, or give a calibrated camera."
         )
     with bar("cameras", "models") as update:
-        parts = _sparse(database, flight, guessed, told, workdir, seed)
+        # Small matrices gain nothing by more threads, and their sums would depend on the machine.
+        with threadpool_limits(1, user_api="blas"):
+            parts = _sparse(database, flight, guessed, told, workdir, seed, bar, warnings)
         update(1, 2)
         if not parts:
             raise InputError(
                 f"No two of the {len(flight)} images could be placed together (best pair: "
                 f"{strongest_pair(database)} common points, 15 needed): give sharp images that overlap by 30 % or more."
             )
-        # Small matrices gain nothing by more threads, and their sums would depend on the machine.
         with threadpool_limits(1, user_api="blas"):
             block = _held_block(flight, parts, origin, told, control, warnings, seed)
         update(2, 2)
@@ -101,7 +108,14 @@ def align(
 
 
 def _sparse(
-    database: Path, flight: Flight, guessed: Sequence[str], told: Array | None, workdir: Path, seed: int
+    database: Path,
+    flight: Flight,
+    guessed: Sequence[str],
+    told: Array | None,
+    workdir: Path,
+    seed: int,
+    bar: Bar,
+    warnings: list[str],
 ) -> list[Bundle]:
     """Sparse models as bundles, the largest first: with the focal lengths that the photos tell, if they tell them.
 
@@ -116,22 +130,40 @@ def _sparse(
         models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
         return [bundle_of(model, numbers) for model in models]
 
-    best = [] if guessed else found(workdir / "held", calibrate=False)
+    best = [] if len(guessed) == len(names) else found(workdir / "held", calibrate=False)
     if not (best and len(best[0]) == len(names)):
         free = found(workdir, calibrate=True)
         best = free if not best or (free and len(free[0]) > len(best[0])) else best
-    if told is None or (best and len(best[0]) == len(names) and agrees_with_gps(best[0], told)):
+    if told is None or (best and len(best[0]) >= ENOUGH * len(names) and agrees_with_gps(best[0], told)):
         return best
     features, lens_ids = read_points(database, names)
-    prior = bundle_by_priors(flight.frames, told, features, read_verified(database, names), lens_ids)
+    with bar("guided matches", "pairs") as update:
+        prior = bundle_by_priors(
+            flight.frames, told, features, read_verified(database, names), lens_ids, progress=update
+        )
     parts = [] if prior is None else components(prior)
-    return parts if parts and _weight(parts) > _weight(best) else best
+    if not parts or (best and not _better(parts, best, told)):
+        return best
+    warnings.append(
+        f"Matches were so few that sparse mapping {_failed(best, told, len(names))}: the cameras were started where "
+        "GPS and gimbals say that they are, and are only roughly held by the images. Fly with more overlap."
+    )
+    return parts
 
 
-def _weight(parts: Sequence[Bundle]) -> tuple[int, int, int]:
-    """By which the better one of two sets of bundles is told: images of the largest, of all, and their good rays."""
-    rays = sum(int((part.errors() <= WORST_PX).sum()) for part in parts)
-    return max((len(part) for part in parts), default=0), sum(len(part) for part in parts), rays
+def _better(parts: Sequence[Bundle], best: Sequence[Bundle], told: Array) -> bool:
+    """Whether bundles by priors are worth more than those of sparse mapping, the largest first in both."""
+    new, old = parts[0], best[0]
+    if not agrees_with_gps(old, told):
+        return len(new) >= len(old)
+    return len(new) > len(old) and float(np.median(new.errors())) < WORSE * float(np.median(old.errors()))
+
+
+def _failed(best: Sequence[Bundle], told: Array, images: int) -> str:
+    if not best:
+        return "placed no image"
+    left = images - len(best[0])
+    return f"left out {left} of {images} images" if agrees_with_gps(best[0], told) else "contradicted GPS"
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:

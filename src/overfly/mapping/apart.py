@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,6 +20,9 @@ FEWEST_POINTS = 25
 WORST_FIT = 0.1
 """Misfit with the median partner, as a share of the image's diagonal, up to which a frame is believed: oblique ones fit
 worse."""
+
+UNLIKE = 3.0
+"""Frames whose pixels are so many times larger or smaller on the ground than usual ones are not believed."""
 
 SAFETY = 1.2
 """Images are taken as so many times larger: GPS, relief and tilt move what they see."""
@@ -50,12 +54,19 @@ def cannot_overlap(
     if not told:
         return set()
     factors = _factors(told, at)
+    if not np.isfinite(list(factors.values())).all():  # copies of a photo, or a drone that hovered
+        return set()
     misfits: dict[int, list[float]] = {}
     for (i, j), (a, b) in told.items():
         away = np.abs(at[i] + factors[i] * a - at[j] - factors[j] * b).mean()
         for k in (i, j):
             misfits.setdefault(k, []).append(float(away / np.abs(factors[k] * _plane(sizes[k]))))
-    believed = [k for k, found in misfits.items() if np.median(found) < WORST_FIT]
+    usual = float(np.median(np.abs(list(factors.values()))))
+    believed = [
+        k
+        for k, found in misfits.items()
+        if np.median(found) < WORST_FIT and usual / UNLIKE < abs(factors[k]) < usual * UNLIKE
+    ]
     shown = {k: _outline(at[k], SAFETY * factors[k], sizes[k]) for k in believed}
     return {(i, j) for i, j in pairs if i in shown and j in shown and shown[i].disjoint(shown[j])}
 
@@ -68,7 +79,7 @@ def _plane(vectors: Any) -> Any:
 def _factors(told: Mapping[Pair, Any], at: NDArray[np.complex128]) -> dict[int, complex]:
     """Metres per pixel and heading of each frame that has common points, as one complex number."""
     from scipy.sparse import coo_array
-    from scipy.sparse.linalg import spsolve
+    from scipy.sparse.linalg import MatrixRankWarning, spsolve
 
     frames = sorted({k for pair in told for k in pair})
     column = {k: c for c, k in enumerate(frames)}
@@ -82,7 +93,9 @@ def _factors(told: Mapping[Pair, Any], at: NDArray[np.complex128]) -> dict[int, 
         right[p] += np.vdot(a, np.full_like(a, away))
         right[q] -= np.vdot(b, np.full_like(b, away))
     normal = coo_array((values, (rows, columns)), shape=(len(frames), len(frames))).tocsc()
-    return dict(zip(frames, np.atleast_1d(spsolve(normal, right)).tolist(), strict=True))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MatrixRankWarning)  # told by what comes out
+        return dict(zip(frames, np.atleast_1d(spsolve(normal, right)).tolist(), strict=True))
 
 
 def _outline(middle: complex, factor: complex, size: tuple[int, int]) -> shapely.Polygon:

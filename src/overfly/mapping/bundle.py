@@ -96,15 +96,18 @@ class Bundle:
         )
 
     def without(self, images: NDArray[np.bool_]) -> Bundle:
-        """Without some images [n] and what only they and one other see."""
+        """Without some images [n], what only they and one other see, and lenses that only they have."""
         kept = self.kept(~images[self.image])
         number = np.cumsum(~images) - 1
+        used, lens_of = np.unique(self.lens_of[~images], return_inverse=True)
         return replace(
             kept,
             frames=self.frames[~images],
             rotations=self.rotations[~images],
             centres=self.centres[~images],
-            lens_of=self.lens_of[~images],
+            lens_of=lens_of.reshape(-1),
+            lenses=self.lenses[used],
+            lens_ids=tuple(self.lens_ids[i] for i in used.tolist()),
             image=number[kept.image],
         )
 

@@ -5,7 +5,7 @@ Sparse mapping adds frame to frame, and each step needs many matches; what is kn
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,14 +20,18 @@ from overfly.mapping.database import focal_px
 from overfly.mapping.guided import guided_matches
 from overfly.mapping.placing import gps_sigmas
 
+UNIT_PX = 800
+"""Longest side of an image to which the lengths below belong, in its pixels; larger ones have larger pixels' errors."""
+
 FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
 """What a ray is taken to be worth, pixels, one adjustment after another: at first directions are wrong by a degree."""
 
 REACH_PX, FAR_REACH_PX = 3.0, 40.0
 """Off its epipolar line a key point is looked for so far, and so far if one of the images has no match yet."""
 
-WINDOWS_APART = 1.2
-"""Images are compared whose centres are nearer than so many times the ground that one sees, corner to corner."""
+FOOTPRINTS_APART, NEAREST = 1.2, 8
+"""Images are compared with so many nearest ones, no farther than so many times the ground that one sees, corner to
+corner."""
 
 RELIEF = (0.02, 0.98, 0.5)
 """Shares of the points between whose heights the ground is looked for, and how much more, of their range, each way."""
@@ -35,7 +39,7 @@ RELIEF = (0.02, 0.98, 0.5)
 FEWEST_RAYS = 8
 """Rays without which an image is not placed: three tell its pose, the others that they are right."""
 
-WORST_PX = 6.0
+FARTHEST_PX = 6.0
 """Rays that miss their point by more at the end are dropped."""
 
 Features = tuple[NDArray, NDArray]
@@ -43,7 +47,13 @@ Verified = Mapping[tuple[int, int], NDArray[np.uint32]]
 
 
 def bundle_by_priors(
-    frames: Sequence[Frame], told: Array, features: Sequence[Features], verified: Verified, lens_ids: Sequence[int]
+    frames: Sequence[Frame],
+    told: Array,
+    features: Sequence[Features],
+    verified: Verified,
+    lens_ids: Sequence[int],
+    *,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Bundle | None:
     """The frames with GPS, gimbal and focal length, adjusted to their matches; None where these do not fit.
 
@@ -53,9 +63,11 @@ def bundle_by_priors(
     Args:
         frames: of the flight, n of them.
         told: their GPS positions [n, 3] in local ENU metres, NaN where unknown.
-        features: pixels [p, 2] and descriptors [p, 128] of the key points of each frame.
+        features: pixels [p, 2] of the key points of each frame, and descriptors [q, 128] of the first q of them: those
+            of a network have none.
         verified: of pairs (i, j), rows of indices of their key points [m, 2].
         lens_ids: what the database calls the camera of each frame.
+        progress: called with (pairs matched again, in all).
     """
     known = [
         i
@@ -92,7 +104,7 @@ def bundle_by_priors(
         rotations=np.where(seen[:, None, None], bundle.rotations, start.rotations),
         centres=np.where(seen[:, None], bundle.centres, start.centres + shift),
     )
-    bundle = _fitted(bundle, own, _more(bundle, own, rows), frames, places, sigmas, SIGMAS_PX)
+    bundle = _fitted(bundle, own, _more(bundle, own, rows, progress), frames, places, sigmas, SIGMAS_PX)
     while len(bundle) and (few := np.bincount(bundle.image, minlength=len(bundle)) < FEWEST_RAYS).any():
         bundle = bundle.without(few)
     return bundle if len(bundle) >= 2 else None
@@ -111,7 +123,8 @@ def _fitted(
     image, point, at = _tracks([pixels for pixels, _ in features], rows)
     points = np.zeros((point.max(initial=-1) + 1, 3))
     bundle = _triangulated(replace(start, points=points, image=image, point=point, pixels=at))
-    for sigma in sigmas_px:
+    unit = max(1.0, max(max(frames[i].width, frames[i].height) for i in start.frames) / UNIT_PX)
+    for sigma in (unit * sigma for sigma in sigmas_px):
         if len(bundle.points) < FEWEST_RAYS:
             return bundle
         held = replace(
@@ -122,11 +135,13 @@ def _fitted(
             lens_fixed=np.ones(len(bundle.lenses), bool),
         )
         bundle = adjusted(bundle, held, tolerance=ROUGHLY).bundle
-        bundle = bundle.kept(bundle.errors() < max(WORST_PX, 4 * sigma))
-    return bundle.kept(bundle.errors() < WORST_PX)
+        bundle = bundle.kept(bundle.errors() < max(unit * FARTHEST_PX, 4 * sigma))
+    return bundle.kept(bundle.errors() < unit * FARTHEST_PX)
 
 
-def _more(bundle: Bundle, features: Sequence[Features], rows: Verified) -> Verified:
+def _more(
+    bundle: Bundle, features: Sequence[Features], rows: Verified, progress: Callable[[int, int], None] | None
+) -> Verified:
     """The matches and those that the cameras' poses lead to."""
     least, most, more = RELIEF
     low, high = np.quantile(bundle.points[:, 2], [least, most])
@@ -134,15 +149,24 @@ def _more(bundle: Bundle, features: Sequence[Features], rows: Verified) -> Verif
     seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
     corner = np.linalg.norm(bundle.lenses[bundle.lens_of, 1:3], axis=1) / bundle.lenses[bundle.lens_of, 0]
     shown = 2 * corner * np.maximum(bundle.centres[:, 2] - low, 0)
-    found = dict(rows)
+    unit = np.maximum(1.0, 2 * bundle.lenses[bundle.lens_of, 1:3].max(1) / UNIT_PX)
+    near: set[tuple[int, int]] = set()
     for i in range(len(bundle)):
-        for j in range(i + 1, len(bundle)):
-            if np.linalg.norm((bundle.centres[i] - bundle.centres[j])[:2]) < WINDOWS_APART * max(shown[i], shown[j]):
-                reach = REACH_PX if seen[i] and seen[j] else FAR_REACH_PX
-                pixels, descriptors = zip(features[i], features[j], strict=True)
-                new = guided_matches(bundle, (i, j), pixels, descriptors, heights, reach)
-                if len(new):
-                    found[i, j] = np.unique(np.concatenate([rows.get((i, j), new[:0]), new]), axis=0)
+        away = np.linalg.norm((bundle.centres - bundle.centres[i])[:, :2], axis=1)
+        away[i] = np.inf
+        partners = np.argsort(away, kind="stable")[:NEAREST]
+        partners = partners[away[partners] < FOOTPRINTS_APART * shown[i]]
+        near |= {(min(i, j), max(i, j)) for j in partners.tolist()}
+    found = dict(rows)
+    for done, (i, j) in enumerate(sorted(near)):
+        reach = (REACH_PX if seen[i] and seen[j] else FAR_REACH_PX) * max(unit[i], unit[j])
+        looks = features[i][1], features[j][1]
+        pixels = features[i][0][: len(looks[0])], features[j][0][: len(looks[1])]
+        new = guided_matches(bundle, (i, j), pixels, looks, heights, reach)
+        if len(new):
+            found[i, j] = np.unique(np.concatenate([rows.get((i, j), new[:0]), new]), axis=0)
+        if progress:
+            progress(done + 1, len(near))
     return found
 
 

@@ -98,17 +98,20 @@ def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
         result: with focal length and lens held.
 
     Returns:
-        The adjusted block, and whether the images leave its focal length open: one that is :data:`FOCAL_TRIED` longer
-        would cost less than that share.
+        The adjusted block, and whether the images leave its focal length open: one that is :data:`FOCAL_TRIED` longer,
+        of all cameras together, would cost less than that share. False where no camera has a focal length by its
+        photos' data, or images enough to try another.
     """
     start = result.lever
     lens = adjusted(result.bundle, replace(result.held, lens_sigma=LENS_SIGMA), lever=start, tolerance=ROUGHLY)
     if result.cost - lens.cost > GAIN * lens.cost:
         result = lens
     needed, untold = GAIN * result.cost, False
-    if np.isfinite(result.held.focals).all():
+    told = np.isfinite(result.held.focals)
+    if (told & ~result.held.lens_fixed).any():
         hopeless = needed / HOPELESS
-        longer = replace(result.held, focals=result.bundle.lenses[:, 0] * (1 + FOCAL_TRIED), focal_sigma=TRIED_SIGMA)
+        focals = np.where(told, result.bundle.lenses[:, 0] * (1 + FOCAL_TRIED), np.nan)
+        longer = replace(result.held, focals=focals, focal_sigma=TRIED_SIGMA)
         tried = adjusted(result.bundle, longer, lever=start, tolerance=hopeless, patience=PATIENCE)
         untold = tried.cost - result.cost < needed
         rays = np.median(np.bincount(result.bundle.image, minlength=len(result.bundle)))

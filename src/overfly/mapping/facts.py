@@ -14,6 +14,9 @@ from overfly.geometry import Array, Camera, project
 from overfly.mapping.raster import Surface
 from overfly.mapping.tiles import Tiles
 
+CLOSED = 10
+"""Half the cells of a gap, up to which it lies within the outline even if it is open to one side."""
+
 ASKED = 200
 """Frames, spread over the flight, that tell the ground sampling distance."""
 
@@ -63,8 +66,18 @@ def _share_once(seen: Surface) -> float:
 
 
 def _share_unmatched(seen: Surface) -> float:
-    """Share of the ground within the map that two frames or more have inside them and that has no point."""
-    if seen.views is None or not (twice := seen.views >= 2).any():
+    """Share of the ground within the map's outline that two frames or more have inside them and that has no point.
+
+    Gaps are within the outline where they are narrow or enclosed; what hides behind a roof counts, too.
+    """
+    from scipy.ndimage import binary_closing, binary_fill_holes
+
+    if seen.views is None:
+        return 0.0
+    padded = np.pad(seen.filled, CLOSED)
+    within = binary_fill_holes(binary_closing(padded, iterations=CLOSED))[CLOSED:-CLOSED, CLOSED:-CLOSED]
+    twice = within & (seen.views >= 2)
+    if not twice.any():
         return 0.0
     return round(float((twice & ~seen.filled).sum() / twice.sum()), 4)
 

@@ -63,7 +63,6 @@ def image_pairs(
     positions: Array | None,
     descriptors: Sequence[NDArray[np.uint8]],
     progress: Callable[[int, int], None] | None = None,
-    neighbours: int = NEIGHBOURS,
 ) -> list[tuple[int, int]]:
     """Which frames to match, as sorted pairs i < j.
 
@@ -71,7 +70,6 @@ def image_pairs(
         positions: [n, 3] local GPS positions, NaN where a frame has none; None without GPS.
         descriptors: of n frames in the order of the flight, the coarsest first.
         progress: called with (coarse pairs compared, in all), where that is needed.
-        neighbours: nearest frames in each direction.
 
     Frames with GPS get the nearest others in each of eight directions, so that strips connect; frames without are
     compared with all others by their few hundred coarsest key points. Neighbours in time are always matched.
@@ -79,10 +77,24 @@ def image_pairs(
     n = len(descriptors)
     if n <= SMALL_FLIGHT:
         return [(i, j) for i in range(n) for j in range(i + 1, n)]
-    pairs = {(i, j) for i in range(n) for j in range(i + 1, min(n, i + 3))}
+    pairs = {(i, j) for i in range(n) for j in range(i + 1, min(n, i + 3))} | nearest_pairs(positions, NEIGHBOURS)
     known = np.zeros(n, bool) if positions is None else np.isfinite(positions[:, :2]).all(1)
+    blind = np.flatnonzero(~known).tolist()
+    if blind:
+        pairs |= _alike(blind, descriptors, progress)
+    return sorted(pairs)
+
+
+def nearest_pairs(positions: Array | None, neighbours: int) -> set[tuple[int, int]]:
+    """Pairs i < j of each frame with GPS and so many nearest others in each of eight directions.
+
+    Args:
+        positions: [n, 3] local GPS positions, NaN where a frame has none; None without GPS.
+        neighbours: in each direction.
+    """
+    pairs: set[tuple[int, int]] = set()
     if positions is not None:
-        places = np.flatnonzero(known)
+        places = np.flatnonzero(np.isfinite(positions[:, :2]).all(1))
         for i in places:
             away = positions[places, :2] - positions[i, :2]
             distance = np.linalg.norm(away, axis=1)
@@ -91,10 +103,7 @@ def image_pairs(
                 inside = np.flatnonzero((sector == s) & (places != i))
                 for j in places[inside[np.argsort(distance[inside], kind="stable")[:neighbours]]]:
                     pairs.add((int(min(i, j)), int(max(i, j))))
-    blind = np.flatnonzero(~known).tolist()
-    if blind:
-        pairs |= _alike(blind, descriptors, progress)
-    return sorted(pairs)
+    return pairs
 
 
 def _alike(

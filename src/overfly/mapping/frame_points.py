@@ -170,7 +170,7 @@ def _look_up(
         for mask in (given, data.get("second"))
     )
     # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
-    inside = (u > -0.5) & (v > -0.5) & (u < other.camera.width - 0.5) & (v < other.camera.height - 0.5)
+    inside = (third > 0) & (u > -0.5) & (v > -0.5) & (u < other.camera.width - 0.5) & (v < other.camera.height - 0.5)
     return there / third, spread / third, was, theirs, inside
 
 

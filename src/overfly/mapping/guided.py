@@ -11,6 +11,9 @@ from overfly.mapping.bundle import Bundle, Index
 RATIO = 0.75
 """Largest distance of a descriptor's match as a share of that of the second best: few candidates compete."""
 
+ROWS = 256
+"""Key points that are looked for at a time."""
+
 MOST_DISTANT = 0.6
 """Largest distance of two matching unit descriptors."""
 
@@ -45,9 +48,13 @@ def guided_matches(
     theirs = np.flatnonzero(((pixels[1] > box[0] - reach) & (pixels[1] < box[1] + reach)).all(1))
     if not len(theirs):
         return np.zeros((0, 2), np.uint32)
-    near = _off_pieces(pixels[1][theirs], low[own], high[own]) < reach
     a, b = (_unit(d[k]) for d, k in zip(descriptors, (own, theirs), strict=True))
-    alike = np.where(near, a @ b.T, -1.0)
+    alike = a @ b.T
+    for start in range(0, len(own), ROWS):
+        some = own[start : start + ROWS]
+        with np.errstate(invalid="ignore"):
+            near = _off_pieces(pixels[1][theirs], low[some], high[some]) < reach
+        alike[start : start + ROWS][~near] = -1
     first, second = _best(alike), _best(alike.T)
     rows = np.flatnonzero((first >= 0) & (second[np.maximum(first, 0)] == np.arange(len(own))))
     return np.column_stack([own[rows], theirs[first[rows]]]).astype(np.uint32)
@@ -77,7 +84,7 @@ def _unit(descriptors: NDArray) -> NDArray[np.float32]:
     return raw / np.maximum(np.linalg.norm(raw, axis=1, keepdims=True), 1e-9)
 
 
-def _best(alike: Array) -> Index:
+def _best(alike: NDArray[np.float32]) -> Index:
     """The column of each row [p] that is clearly the most alike, -1 where none is."""
     best = alike.argmax(1)
     rows = np.arange(len(alike))

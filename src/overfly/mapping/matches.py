@@ -25,7 +25,7 @@ from overfly.mapping.database import (
     write_matches,
 )
 from overfly.mapping.encoder_matches import Picture, Prior, match_pair, overlay, picture
-from overfly.mapping.features import MOST_PARTNERS, features, image_pairs
+from overfly.mapping.features import MOST_PARTNERS, SMALL_FLIGHT, features, image_pairs, nearest_pairs
 from overfly.networks.encoder import Encoder
 
 Bar = Callable[[str, str], AbstractContextManager[Callable[..., Any]]]
@@ -97,19 +97,30 @@ def _match(
 ) -> None:
     """Match the nearest pairs, then of the others those that may see common ground by what these have shown."""
     names = [frame.name for frame in flight.frames]
-    first = pairs if told is None else sorted(set(pairs) & set(image_pairs(told, [d for _, d in found], neighbours=1)))
+    asked = [] if told is None or len(names) <= SMALL_FLIGHT else _second_ring(pairs, told)
+    first = sorted(set(pairs) - set(asked))
     match_pairs(database, names, first, seed=seed, progress=lambda done, _: update(done, len(pairs)))
-    if told is None:
+    if not asked:
         return
+    assert told is not None
+    # Of the first ring alone, whatever an interrupted run has matched besides: the same pairs are asked for again.
     verified = {
         (i, j): (found[i][0][rows[:, 0]], found[j][0][rows[:, 1]])
         for (i, j), rows in read_verified(database, names).items()
+        if (i, j) in set(first)
     }
-    asked = sorted(set(pairs) - set(first))
     apart = cannot_overlap(asked, told[:, :2], [(f.width, f.height) for f in flight.frames], verified)
     rest = [pair for pair in asked if pair not in apart]
     ready = len(pairs) - len(rest)
     match_pairs(database, names, rest, seed=seed, progress=lambda done, _: update(ready + done, len(pairs)))
+    update(len(pairs), len(pairs))
+
+
+def _second_ring(pairs: Pairs, told: Array) -> Pairs:
+    """Pairs of frames with GPS that are not neighbours in time, nor the nearest in any direction."""
+    known = np.asarray(np.isfinite(told[:, :2]).all(1))
+    first = nearest_pairs(told, 1)
+    return [(i, j) for i, j in pairs if j - i > 2 and known[i] and known[j] and (i, j) not in first]
 
 
 def encoder_matches(

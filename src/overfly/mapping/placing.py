@@ -23,6 +23,9 @@ BAROMETER_SIGMA_M = 0.15
 FAR_OFF_M = 8.0
 """A position or height at least this far (and six times the median) off the common fit is wrong."""
 
+DISTORTED = 0.05
+"""Share of the flight's extent by which cameras may be off GPS: delays and antennas move them by some metres."""
+
 UNKNOWN_M = 1e3
 """Standard deviation of a height of which nothing is known."""
 
@@ -103,7 +106,9 @@ def agrees_with_gps(bundle: Bundle, told: Array) -> bool:
         moved = bundle.moved(by_gps(bundle.centres, places, [None] * len(bundle), bundle.world_from_camera))
     except InputError:
         return True
-    return float(np.nanmedian(np.linalg.norm((moved.centres - places)[:, :2], axis=1))) < FAR_OFF_M
+    away = float(np.nanmedian(np.linalg.norm((moved.centres - places)[:, :2], axis=1)))
+    extent = float((np.nanmax(places[:, :2], axis=0) - np.nanmin(places[:, :2], axis=0)).max())
+    return away < max(FAR_OFF_M, DISTORTED * extent)
 
 
 def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warnings: list[str]) -> Array:

@@ -92,7 +92,7 @@ def raster_products(
         raise InputError("The cloud holds no points, so there is no surface to draw: check the overlap of the images.")
     few = cloud.sample(sample)
     pixel = float(f"{gsd:.1e}")  # cells with a length that people can read, and that other maps of the place share
-    parts = round(cell_size(cloud.some(2 * sample), pixel) / pixel)
+    parts = int(np.ceil(cell_size(cloud.some(2 * sample), pixel) / pixel - 0.25))
     grid = grid_over(few.points, float(f"{parts * pixel:.12g}"), trim=0.0005)
     if grid.rows * grid.columns > max(MAX_CELLS, EMPTIEST * len(cloud)):
         raise InputError(

@@ -109,7 +109,7 @@ class Sight:
 
     def coarseness(self, cell: float) -> float:
         """How far, on the ground, points decide of each other in a :meth:`buffer` of that cell: its pixel, then two."""
-        return 3 * FINENESS * cell * self.above / self.near
+        return 3 * FINENESS * cell * self.above * float(np.hypot(1, self.steepest)) / self.near
 
     def ideal(self, part: Chunk, x: Array, y: Array, z: Map) -> tuple[Map, Map, Map, Map]:
         """Ideal coordinates x/z, y/z, depth and squared tangent off the vertical of a chunk's points.
