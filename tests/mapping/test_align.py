@@ -6,6 +6,7 @@ import shutil
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -212,6 +213,40 @@ def test_frames_without_gps_join_those_that_have_it() -> None:
     features = [rng.integers(0, 120, (200, 128), dtype=np.uint8) for _ in range(12)]
     features[2][:60] = features[7][:60]
     assert (2, 7) in image_pairs(positions, features)
+
+
+def test_an_interrupted_matching_goes_on_with_the_same_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the second ring had matched before the kill must not decide which of its pairs are asked for."""
+    from overfly.mapping import matches
+
+    positions = np.array([[30.0 * (i % 5), 40.0 * (i // 5), 0] for i in range(15)])
+    flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(15)])
+    features = [(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))] * 15
+    pairs = image_pairs(positions, [d for _, d in features])
+    told: list[set[tuple[int, int]]] = []
+
+    def asked_with(kept: list[tuple[int, int]]) -> tuple[list[list[tuple[int, int]]], int]:
+        calls: list[list[tuple[int, int]]] = []
+        rows = {pair: np.zeros((0, 2), np.uint32) for pair in kept}
+        monkeypatch.setattr(matches, "match_pairs", lambda *args, **_: calls.append(args[2]))
+        monkeypatch.setattr(matches, "read_verified", lambda *_: rows | dict.fromkeys(calls[0], rows[kept[0]]))
+
+        def apart(asked: list, *given: Any) -> set[tuple[int, int]]:
+            told.append(set(given[2]))
+            return set(asked[::2])
+
+        monkeypatch.setattr(matches, "cannot_overlap", apart)
+        progress: list[tuple[int, int]] = []
+        matches._match(tmp_path / "db", flight, positions, pairs, features, 0, lambda *at: progress.append(at))
+        assert progress[-1] == (len(pairs), len(pairs))
+        return calls, len(pairs)
+
+    (first, rest), _ = asked_with([(0, 2)])
+    assert not set(first) & set(rest)
+    assert 0 < len(rest) < len(set(pairs) - set(first))
+    again, _ = asked_with(rest)
+    assert again == [first, rest]
+    assert told[0] == told[1] == set(first)
 
 
 def test_half_of_brighton_at_half_size(shared_data, tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]

@@ -13,6 +13,7 @@ from overfly.geometry import Array, Camera, fit_similarity, pose, project, rotat
 from overfly.mapping.bundle import Bundle, components
 from overfly.mapping.by_priors import bundle_by_priors
 from overfly.mapping.guided import guided_matches
+from overfly.mapping.placing import agrees_with_gps
 
 CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
 SHOWN = 250
@@ -100,6 +101,19 @@ def test_without_priors_or_matches_there_is_no_block(lacking: str) -> None:
     told = np.full_like(block.told, np.nan) if lacking == "gps" else block.told
     matches = {} if lacking == "matches" else block.common(12)
     assert bundle_by_priors(frames, told, block.features, matches, [1] * 8) is None
+
+
+def test_a_bundle_that_contradicts_gps_is_told_from_one_that_is_only_off_by_some_metres() -> None:
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    assert agrees_with_gps(found, block.told)
+    scaled = found.moved(np.diag([3.0, 3.0, 3.0, 1.0]))  # a similarity away
+    assert agrees_with_gps(scaled, block.told)
+    late = block.told + np.where(np.arange(8) < 4, 1, -1)[:, None] * [0.0, 5.0, 0.0]  # GPS lags on lines to and fro
+    assert agrees_with_gps(found, late)
+    folded = replace(found, centres=np.where(np.arange(8)[:, None] < 4, found.centres, found.centres[::-1]))
+    assert not agrees_with_gps(folded, block.told)
 
 
 def test_guided_matches_are_the_right_ones() -> None:
