@@ -114,6 +114,8 @@ def test_a_bundle_that_contradicts_gps_is_told_from_one_that_is_only_off_by_some
     assert agrees_with_gps(found, late)
     folded = replace(found, centres=np.where(np.arange(8)[:, None] < 4, found.centres, found.centres[::-1]))
     assert not agrees_with_gps(folded, block.told)
+    lost = replace(found, centres=found.centres + 300.0 * (np.arange(8) == 2)[:, None])
+    assert not agrees_with_gps(lost, block.told)
 
 
 def test_guided_matches_are_the_right_ones() -> None:

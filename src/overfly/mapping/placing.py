@@ -26,6 +26,9 @@ FAR_OFF_M = 8.0
 DISTORTED = 0.05
 """Share of the flight's extent by which cameras may be off GPS: delays and antennas move them by some metres."""
 
+LOST = 4.0
+"""Times as far as most may be, at which a single image counts as lost."""
+
 UNKNOWN_M = 1e3
 """Standard deviation of a height of which nothing is known."""
 
@@ -100,15 +103,19 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
 
 
 def agrees_with_gps(bundle: Bundle, told: Array) -> bool:
-    """Whether a bundle, brought to the flight's GPS positions [n, 3] by a similarity, comes near to most of them."""
+    """Whether a bundle, brought to the flight's GPS positions [n, 3] by a similarity, comes near to most of them.
+
+    No image may be far away from its own: either its position is wrong, or it has been placed by wrong matches.
+    """
     places = told[bundle.frames]
     try:
         moved = bundle.moved(by_gps(bundle.centres, places, [None] * len(bundle), bundle.world_from_camera))
     except InputError:
         return True
-    away = float(np.nanmedian(np.linalg.norm((moved.centres - places)[:, :2], axis=1)))
+    away = np.linalg.norm((moved.centres - places)[:, :2], axis=1)
     extent = float((np.nanmax(places[:, :2], axis=0) - np.nanmin(places[:, :2], axis=0)).max())
-    return away < max(FAR_OFF_M, DISTORTED * extent)
+    usual = max(FAR_OFF_M, DISTORTED * extent)
+    return float(np.nanmedian(away)) < usual and float(np.nanmax(away)) < LOST * usual
 
 
 def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warnings: list[str]) -> Array:
