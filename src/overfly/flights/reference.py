@@ -12,7 +12,8 @@ from scipy.ndimage import maximum_filter
 
 from overfly.cloud import Cloud
 from overfly.errors import InputError
-from overfly.geometry import Array, Camera, project
+from overfly.flights.footprint import border_pixels
+from overfly.geometry import Array, Camera, project, rays
 
 if TYPE_CHECKING:
     from overfly.scenes import Scene
@@ -70,11 +71,22 @@ def reference_cloud(
         open_ = np.flatnonzero(~visible)
         if not len(open_):
             break
-        visible[open_[seen(points[open_], depth(pose), camera, pose)]] = True
+        shown = depth(pose)
+        away = np.abs(points[open_, :2] - pose[:2, 3]).max(1)
+        open_ = open_[away <= _reach(shown, camera)]  # of a long flight most points are far from any one frame
+        visible[open_[seen(points[open_], shown, camera, pose)]] = True
     points, colors = points[visible], colors[visible]
     if not len(points):
         raise InputError(f"The flight sees nothing of the scene {scene.name}: choose an area inside it.")
     return Cloud(points=points[:n], colors=colors[:n])
+
+
+def _reach(depth: NDArray[np.float32], camera: Camera) -> float:
+    """How far away the farthest thing is that a frame shows; infinite where it shows the sky."""
+    corners = rays(border_pixels(camera), camera)
+    farthest = float(np.linalg.norm(corners, axis=1).max())  # NaN where the lens has no ray for a corner
+    reach = (float(depth.max(initial=0.0)) + TOLERANCE_M) * farthest
+    return reach if np.isfinite(reach) else float("inf")
 
 
 def _within(scene: Any, box: tuple[float, float, float, float]) -> Any:
