@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
@@ -32,6 +33,10 @@ FEWEST_TO_JUDGE, UNJUDGED_M = 4, 1.5
 
 SCALE_UNSURE = 0.04
 """Standard deviation of the scale by GPS, as a share, from which on it is told."""
+
+AROUND, OFF_OTHERS = 8, 0.35
+"""Nearest points in plan that a sparse point is compared with, none farther than the cameras are high; share of that
+height that it may be off them."""
 
 ENOUGH = 0.95
 """Share of the images that sparse mapping must place, or their priors are tried as well."""
@@ -287,13 +292,14 @@ def _block(
         np.bincount(bundle.point, minlength=len(bundle.points)), 1
     )
     points = bundle.points[: len(bundle.points) - extra]
+    points = points[mean[: len(points)] < 2]
     return Block(
         frames=known,
         origin=origin,
         cameras_from="estimated",
         metric=metric,
         reprojection_px=float(errors[tied].mean()),
-        points=points[mean[: len(points)] < 2],
+        points=points[beside_others(points, bundle.centres)],
         survey=None if ruled is None else ruled.survey,
         precision=precision_of(result) if metric else Precision(why_not="no GPS and no control gives the block metres"),
         links=[(i, j, count) for (i, j), count in bundle.links().items()],
@@ -301,6 +307,21 @@ def _block(
         held_by_gps=apart,
         warnings=warnings,
     )
+
+
+def beside_others(points: Array, centres: Array) -> NDArray[np.bool_]:
+    """Which sparse points [m, 3], z up, have others around them, and are about as high: wrong matches lie far away.
+
+    They tell how deep stereo looks for the ground.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) <= AROUND:
+        return np.ones(len(points), bool)
+    height = abs(float(np.median(centres[:, 2]) - np.median(points[:, 2])))
+    away, near = (np.asarray(found) for found in cKDTree(points[:, :2]).query(points[:, :2], k=AROUND + 1))
+    off = np.abs(points[:, 2] - np.median(points[:, 2][near[:, 1:]], axis=1))
+    return np.asarray((off < OFF_OTHERS * height) & (away[:, -1] < height))
 
 
 def precision_of(result: Adjusted) -> Precision:
