@@ -18,8 +18,9 @@ from overfly.flights import Flight, Frame, read_flight
 from overfly.geodesy import Origin, enu_from_geodetic, geodetic_from_enu
 from overfly.geometry import fit_similarity, transform
 from overfly.mapping import normal_equations
-from overfly.mapping.align import align, beside_others
+from overfly.mapping.align import align
 from overfly.mapping.database import focal_px
+from overfly.mapping.depth_ranges import beside_others
 from overfly.mapping.features import image_pairs
 
 pytestmark = pytest.mark.usefixtures("few_features")

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
@@ -15,16 +14,16 @@ from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array
 from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
-from overfly.mapping.bundle import Bundle, bundle_of, components
-from overfly.mapping.by_priors import bundle_by_priors
+from overfly.mapping.bundle import Bundle
 from overfly.mapping.calibration import FOCAL_TRIED, adjusted_twice, calibrated, held_by_images
 from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
-from overfly.mapping.database import focal_px, read_points, read_verified, strongest_pair
+from overfly.mapping.database import focal_px, strongest_pair
+from overfly.mapping.depth_ranges import beside_others
 from overfly.mapping.georeference import by_ground
 from overfly.mapping.matches import Bar, matched
-from overfly.mapping.model import mapped
-from overfly.mapping.placing import UNKNOWN_M, agrees_with_gps, placed
+from overfly.mapping.placing import UNKNOWN_M, placed
+from overfly.mapping.sparse import sparse_parts
 from overfly.mapping.survey import Precision
 from overfly.networks.encoder import Encoder
 
@@ -33,16 +32,6 @@ FEWEST_TO_JUDGE, UNJUDGED_M = 4, 1.5
 
 SCALE_UNSURE = 0.04
 """Standard deviation of the scale by GPS, as a share, from which on it is told."""
-
-AROUND, OFF_OTHERS = 8, 0.35
-"""Nearest points in plan that a sparse point is compared with, none farther than the cameras are high; share of that
-height that it may be off them."""
-
-ENOUGH = 0.95
-"""Share of the images that sparse mapping must place, or their priors are tried as well."""
-
-WORSE = 2.0
-"""Times by which reprojection errors may be larger where more images are placed."""
 
 FOCAL_DRIFT = 0.1
 """Share by which a focal length may differ from the photos' data before this is said."""
@@ -99,7 +88,7 @@ def align(
     with bar("cameras", "models") as update:
         # Small matrices gain nothing by more threads, and their sums would depend on the machine.
         with threadpool_limits(1, user_api="blas"):
-            parts = _sparse(database, flight, guessed, told, workdir, seed, bar, warnings)
+            parts = sparse_parts(database, flight, guessed, told, workdir, seed, bar, warnings)
         update(1, 2)
         if not parts:
             raise InputError(
@@ -110,65 +99,6 @@ def align(
             block = _held_block(flight, parts, origin, told, control, warnings, seed)
         update(2, 2)
     return block
-
-
-def _sparse(
-    database: Path,
-    flight: Flight,
-    guessed: Sequence[str],
-    told: Array | None,
-    workdir: Path,
-    seed: int,
-    bar: Bar,
-    warnings: list[str],
-) -> list[Bundle]:
-    """Sparse models as bundles, the largest first: with the focal lengths that the photos tell, if they tell them.
-
-    Over flat ground a focal length without limits may run away, and everything with it; it is let go only where not
-    all images could be placed with the one that is told. Where matches are so few that sparse mapping leaves images
-    out or contradicts GPS, cameras start where GPS and gimbals say that they are.
-    """
-    names = [frame.name for frame in flight.frames]
-    numbers = {name: i for i, name in enumerate(names)}
-
-    def found(folder: Path, calibrate: bool) -> list[Bundle]:
-        models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
-        return [bundle_of(model, numbers) for model in models]
-
-    best = [] if len(guessed) == len(names) else found(workdir / "held", calibrate=False)
-    if not (best and len(best[0]) == len(names)):
-        free = found(workdir, calibrate=True)
-        best = free if not best or (free and len(free[0]) > len(best[0])) else best
-    if told is None or (best and len(best[0]) >= ENOUGH * len(names) and agrees_with_gps(best[0], told)):
-        return best
-    features, lens_ids = read_points(database, names)
-    with bar("guided matches", "pairs") as update:
-        prior = bundle_by_priors(
-            flight.frames, told, features, read_verified(database, names), lens_ids, progress=update
-        )
-    parts = [] if prior is None else components(prior)
-    if not parts or (best and not _better(parts, best, told)):
-        return best
-    warnings.append(
-        f"Matches were so few that sparse mapping {_failed(best, told, len(names))}: the cameras were started where "
-        "GPS and gimbals say that they are, and are only roughly held by the images. Fly with more overlap."
-    )
-    return parts
-
-
-def _better(parts: Sequence[Bundle], best: Sequence[Bundle], told: Array) -> bool:
-    """Whether bundles by priors are worth more than those of sparse mapping, the largest first in both."""
-    new, old = parts[0], best[0]
-    if not agrees_with_gps(old, told):
-        return len(new) >= len(old)
-    return len(new) > len(old) and float(np.median(new.errors())) < WORSE * float(np.median(old.errors()))
-
-
-def _failed(best: Sequence[Bundle], told: Array, images: int) -> str:
-    if not best:
-        return "placed no image"
-    left = images - len(best[0])
-    return f"left out {left} of {images} images" if agrees_with_gps(best[0], told) else "contradicted GPS"
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
@@ -307,21 +237,6 @@ def _block(
         held_by_gps=apart,
         warnings=warnings,
     )
-
-
-def beside_others(points: Array, centres: Array) -> NDArray[np.bool_]:
-    """Which sparse points [m, 3], z up, have others around them, and are about as high: wrong matches lie far away.
-
-    They tell how deep stereo looks for the ground.
-    """
-    from scipy.spatial import cKDTree
-
-    if len(points) <= AROUND:
-        return np.ones(len(points), bool)
-    height = abs(float(np.median(centres[:, 2]) - np.median(points[:, 2])))
-    away, near = (np.asarray(found) for found in cKDTree(points[:, :2]).query(points[:, :2], k=AROUND + 1))
-    off = np.abs(points[:, 2] - np.median(points[:, 2][near[:, 1:]], axis=1))
-    return np.asarray((off < OFF_OTHERS * height) & (away[:, -1] < height))
 
 
 def precision_of(result: Adjusted) -> Precision:

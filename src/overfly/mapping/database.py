@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -122,12 +122,7 @@ def read_matches(path: Path, names: Sequence[str]) -> dict[tuple[int, int], NDAr
     import pycolmap
 
     with pycolmap.Database.open(path) as db:
-        index = {db.read_image_with_name(name).image_id: i for i, name in enumerate(names)}
-        found = {}
-        for pair, rows in zip(*db.read_all_matches(), strict=True):
-            i, j = (index[image] for image in pycolmap.pair_id_to_image_pair(pair))
-            found[min(i, j), max(i, j)] = rows if i < j else rows[:, ::-1]
-    return found
+        return _of_frames(db, names, zip(*db.read_all_matches(), strict=True))
 
 
 def read_verified(path: Path, names: Sequence[str]) -> dict[tuple[int, int], NDArray[np.uint32]]:
@@ -135,13 +130,22 @@ def read_verified(path: Path, names: Sequence[str]) -> dict[tuple[int, int], NDA
     import pycolmap
 
     with pycolmap.Database.open(path) as db:
-        index = {db.read_image_with_name(name).image_id: i for i, name in enumerate(names)}
-        found = {}
-        for pair, geometry in zip(*db.read_two_view_geometries(), strict=True):
-            i, j = (index[image] for image in pycolmap.pair_id_to_image_pair(pair))
-            rows = geometry.inlier_matches
-            found[min(i, j), max(i, j)] = rows if i < j else rows[:, ::-1]
-    return found
+        pairs, geometries = db.read_two_view_geometries()
+        return _of_frames(db, names, ((p, g.inlier_matches) for p, g in zip(pairs, geometries, strict=True)))
+
+
+def _of_frames(
+    db: Any, names: Sequence[str], found: Iterable[tuple[int, NDArray[np.uint32]]]
+) -> dict[tuple[int, int], NDArray[np.uint32]]:
+    """Rows of the database's pairs by the numbers of their frames, the lower one first."""
+    import pycolmap
+
+    index = {db.read_image_with_name(name).image_id: i for i, name in enumerate(names)}
+    by_frames = {}
+    for pair, rows in found:
+        i, j = (index[image] for image in pycolmap.pair_id_to_image_pair(pair))
+        by_frames[min(i, j), max(i, j)] = rows if i < j else rows[:, ::-1]
+    return by_frames
 
 
 def read_points(path: Path, names: Sequence[str]) -> tuple[list[tuple[NDArray, NDArray]], list[int]]:

@@ -23,10 +23,10 @@ from overfly.mapping.block_marks import marks_of
 from overfly.mapping.cautions import cautions
 from overfly.mapping.facts import cloud_facts, ground_sampling, heights_above_ground
 from overfly.mapping.gains import Gains
-from overfly.mapping.gallery import gallery, upright
+from overfly.mapping.gallery import gallery, photo_overview, upright
 from overfly.mapping.heights import heights_of
 from overfly.mapping.orthophoto import Orthophoto
-from overfly.mapping.products import SAMPLE, WINDOW, photo_overview, raster_products
+from overfly.mapping.products import SAMPLE, WINDOW, raster_products
 from overfly.mapping.raster import Grid, Surface
 from overfly.mapping.report import Caution, count_text, duration, write_report
 from overfly.mapping.rough_mesh import filled_share, rough_mesh, without_spikes

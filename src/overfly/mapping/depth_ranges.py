@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.geometry import Array, Camera, project
@@ -12,6 +13,10 @@ from overfly.mapping.culling import Groups
 
 STRAYS = 2.5
 """Points of a frame at either end that may be wrong: of few points half a per cent is none."""
+
+AROUND, OFF_OTHERS = 8, 0.35
+"""Nearest points in plan that a sparse point is compared with, none farther than the cameras are high; share of that
+height that it may be off them."""
 
 BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
@@ -51,3 +56,20 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
             own = (float(low), float(middle), float(high))
         settled.append(own)
     return settled
+
+
+def beside_others(points: Array, centres: Array) -> NDArray[np.bool_]:
+    """Which sparse points [m, 3], z up, have others around them, and are about as high: wrong matches lie far away.
+
+    Args:
+        points: they tell the depths that are looked for.
+        centres: of the cameras [n, 3].
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) <= AROUND:
+        return np.ones(len(points), bool)
+    height = abs(float(np.median(centres[:, 2]) - np.median(points[:, 2])))
+    away, near = (np.asarray(found) for found in cKDTree(points[:, :2]).query(points[:, :2], k=AROUND + 1))
+    off = np.abs(points[:, 2] - np.median(points[:, 2][near[:, 1:]], axis=1))
+    return np.asarray((off < OFF_OTHERS * height) & (away[:, -1] < height))

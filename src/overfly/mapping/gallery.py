@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,6 +129,17 @@ def gallery(
         caption = "Where the surface was measured, and where it is only predicted: do not measure there."
         shown.append(Picture("Measured and predicted", "Measured and predicted ground", caption, pictures.png(picture)))
     return shown, replace(seen, views=views)
+
+
+def photo_overview(path: Path, *, longest: int = 1400) -> NDArray[np.uint8]:
+    """An orthophoto made small [rows, columns, 3], white where it is empty."""
+    import rasterio
+
+    with rasterio.open(path) as source:
+        factor = min(1.0, longest / max(source.width, source.height))
+        shape = max(1, round(source.height * factor)), max(1, round(source.width * factor))
+        *colors, alpha = source.read(out_shape=(4, *shape), resampling=rasterio.enums.Resampling.average)
+    return np.where(alpha[..., None] > 0, np.stack(colors, axis=-1), np.uint8(255))
 
 
 def enlarged(image: NDArray[np.uint8], pixels: int = 700) -> NDArray[np.uint8]:

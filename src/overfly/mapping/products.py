@@ -111,17 +111,6 @@ def raster_products(
     return grid
 
 
-def photo_overview(path: Path, *, longest: int = 1400) -> NDArray[np.uint8]:
-    """An orthophoto made small [rows, columns, 3], white where it is empty."""
-    import rasterio
-
-    with rasterio.open(path) as source:
-        factor = min(1.0, longest / max(source.width, source.height))
-        shape = max(1, round(source.height * factor)), max(1, round(source.width * factor))
-        *colors, alpha = source.read(out_shape=(4, *shape), resampling=rasterio.enums.Resampling.average)
-    return np.where(alpha[..., None] > 0, np.stack(colors, axis=-1), np.uint8(255))
-
-
 def cell_size(clouds: Sequence[Cloud], gsd: float) -> float:
     """Twice the GSD, or as much more as it takes for three points in a filled cell on average.
 
