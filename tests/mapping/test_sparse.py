@@ -1,0 +1,88 @@
+"""In which order cameras are looked for, and which of the answers is taken."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from overfly.flights import Flight, Frame
+from overfly.mapping import sparse
+
+
+class Part:
+    """A bundle, as far as the choice looks at it."""
+
+    def __init__(self, name: str, images: int, error: float = 0.2) -> None:
+        self.name, self.images, self.error = name, images, error
+
+    def __len__(self) -> int:
+        return self.images
+
+    def errors(self) -> np.ndarray:
+        return np.full(50, self.error)
+
+
+HELD, FREE, PRIOR = Part("held", 20), Part("free", 20), Part("prior", 20)
+
+
+@pytest.mark.parametrize(
+    ("held", "free", "prior", "agrees", "guessed", "taken", "asked"),
+    [
+        (HELD, FREE, PRIOR, True, 0, "held", ["held"]),
+        (Part("held", 12), FREE, PRIOR, True, 0, "free", ["held", "free"]),
+        (HELD, FREE, PRIOR, True, 20, "free", ["free"]),  # no photo tells a focal length
+        (HELD, FREE, PRIOR, True, 1, "held", ["held"]),
+        (Part("held", 12), Part("free", 11), PRIOR, True, 0, "prior", ["held", "free", "prior"]),
+        (Part("held", 12), Part("free", 11), Part("prior", 20, 2.0), True, 0, "held", ["held", "free", "prior"]),
+        (HELD, FREE, PRIOR, False, 0, "prior", ["held", "prior"]),
+        (HELD, FREE, Part("prior", 19), False, 0, "held", ["held", "prior"]),
+        (HELD, FREE, None, False, 0, "held", ["held", "prior"]),
+        (None, None, PRIOR, True, 0, "prior", ["held", "free", "prior"]),
+        (Part("held", 19), FREE, None, True, 0, "free", ["held", "free"]),
+    ],
+)
+def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_needed(
+    held: Part | None,
+    free: Part | None,
+    prior: Part | None,
+    agrees: bool,
+    guessed: int,
+    taken: str,
+    asked: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried: list[str] = []
+
+    def mapped(*_: Any, calibrate: bool, **__: Any) -> list[Part]:
+        tried.append("free" if calibrate else "held")
+        found = free if calibrate else held
+        return [] if found is None else [found]
+
+    def by_priors(*_: Any, **__: Any) -> Part | None:
+        tried.append("prior")
+        return prior
+
+    monkeypatch.setattr(sparse, "mapped", mapped)
+    monkeypatch.setattr(sparse, "bundle_of", lambda model, _: model)
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: agrees)
+    monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
+    monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
+    monkeypatch.setattr(sparse, "bundle_by_priors", by_priors)
+    monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
+    names = [f"{i}.jpg" for i in range(20)]
+    flight = Flight(tmp_path, [Frame(name, tmp_path / name, 400, 300) for name in names])
+    warnings: list[str] = []
+    parts: Any = sparse.sparse_parts(
+        tmp_path / "db", flight, names[:guessed], np.zeros((20, 3)), tmp_path, 0,
+        lambda *_: nullcontext(lambda *_: None), warnings,
+    )  # fmt: skip
+    assert [part.name for part in parts] == [taken]
+    assert tried == asked
+    assert bool(warnings) == (taken == "prior")
+    if warnings:
+        assert ("contradicted GPS" in warnings[0]) == (held is not None and not agrees)
