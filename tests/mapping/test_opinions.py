@@ -103,7 +103,7 @@ def test_what_pairs_have_measured_tells_the_ground_best(hill, strips, camera, tm
 def test_a_network_sees_whole_pictures_hardly_stretched(shape) -> None:  # type: ignore[no-untyped-def]
     camera = Camera(*shape, 3000.0, 3000.0, shape[0] / 2, shape[1] / 2)
     small = octave_camera(camera, (128, 96))
-    assert small.width % 128 == small.height % 128 == 0  # two octaves over multiples of 32
+    assert small.width % 64 == small.height % 64 == 0  # an octave over multiples of 32
     assert 0.85 < small.fx / small.fy < 1.18
     assert small.fov_deg == pytest.approx(camera.fov_deg)
 
@@ -182,7 +182,9 @@ def test_no_point_comes_from_where_the_lens_has_shown_nothing(camera: Camera, tm
     assert cloud.colors.min() > 190
 
 
-@pytest.mark.parametrize(("partners", "score", "kept"), [(1, 0.35, True), (2, 0.35, False), (2, 0.5, True)])
+@pytest.mark.parametrize(
+    ("partners", "score", "kept"), [(1, 0.35, True), (2, 0.35, False), (2, 0.5, True), (3, 0.5, False)]
+)
 def test_a_pair_alone_must_correlate_better_where_more_partners_see_the_place(
     camera: Camera, partners: int, score: float, kept: bool, tmp_path: Path
 ) -> None:
@@ -196,3 +198,23 @@ def test_a_pair_alone_must_correlate_better_where_more_partners_see_the_place(
     near = [(other, data, None), *[(other, empty, None)] * (partners - 1)]
     cloud, *_ = frame_points(own, data, near, frame, single=True)
     assert len(cloud) == (camera.width * camera.height if kept else 0)
+
+
+@pytest.mark.parametrize(("others", "kept"), [(0, True), (1, False)])
+def test_a_wall_that_two_frames_alone_see_stands_though_its_depth_changes_from_pixel_to_pixel(
+    camera: Camera, others: int, kept: bool, tmp_path: Path
+) -> None:
+    """Between the depths of two neighbouring pixels of the other frame lies what the first one sees of the wall."""
+    shape = camera.height, camera.width
+    blank = {"sigma": np.full(shape, 0.01, np.float32), "support": np.ones(shape, np.uint8)}
+    wall = np.full(shape, 50, np.float32) + 2 * (np.arange(camera.width) % 2).astype(np.float32)  # of two columns each
+    data = blank | {"depth": np.full(shape, 51, np.float32), "score": np.full(shape, 0.9, np.float32)}
+    own, other = (DepthMap(name, camera, np.eye(4), [], tmp_path / f"{name}.npz") for name in ("a", "b"))
+    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
+    Image.fromarray(np.full((*shape, 3), 200, np.uint8)).save(frame.path)
+    empty = blank | {"depth": np.full(shape, np.nan, np.float32)}
+    near = [(other, data | {"depth": wall}, None), *[(other, empty, None)] * others]
+    cloud, *_ = frame_points(own, data, near, frame, single=True)
+    assert len(cloud) == (camera.width * camera.height if kept else 0)
+    off = [(other, data | {"depth": wall + 4}, None)]
+    assert not len(frame_points(own, data, off, frame, single=True)[0])

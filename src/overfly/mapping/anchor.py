@@ -15,20 +15,23 @@ from numpy.typing import NDArray
 
 Map = NDArray[np.float32]
 
-CELLS = 24
+CELLS = 30
 """Cells along the longer side, of which the measured median is taken: smaller than a block, larger than a house."""
 
 SHARE = 0.4
 """Of a cell's pixels, this many must be measured for its median to count: roofs alone are no ground."""
 
-BENDING, SLOPING = 0.5, 0.02
+BENDING, SLOPING = 1.0, 0.02
 """Weights of second and first differences between cells against a wholly measured cell."""
 
 OUTLIER, ROUNDS = 0.005, 6
 """Share of the camera's height over the surface by which a cell may miss the plate at full weight, and how often cells
 are weighed anew: a roof or a wood beside a gap says little of the ground in it."""
 
-TALL = 0.03
+ABOVE = 4.0
+"""How much more a cell over the plate is taken to miss it than one under it: what stands on the ground is over it."""
+
+TALL = 0.05
 """Share of the camera's height over the surface by which something must rise over its surroundings to be believed."""
 
 SHRUNK = 0.7
@@ -104,5 +107,6 @@ def _plate(medians: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArra
     w = weights
     for _ in range(ROUNDS):
         plate = spsolve((stiff + diags_array(w.ravel())).tocsc(), (w * medians).ravel()).reshape(rows, columns)
-        w = weights * limit / np.maximum(np.abs(medians - plate), max(limit, 1e-9))
+        over = medians - plate
+        w = weights * limit / np.maximum(np.where(over > 0, ABOVE * over, -over), max(limit, 1e-9))
     return np.asarray(plate)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from overfly.cloud import Cloud
 from overfly.flights import Frame
-from overfly.geometry import unproject
+from overfly.geometry import Array, project, unproject
 from overfly.mapping.depth_map import DepthMap
 from overfly.mapping.subpixel import Map, frame_to_frame
 
@@ -19,8 +19,8 @@ GATE = 3.0
 WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
 
-SEEN_BY_MANY, WORST_OF_ONE_PAIR = 2, 0.45
-"""Where so many partners have the place inside and only one pair has matched it, it must correlate as well as that."""
+UNMATCHED = 0.15
+"""What is added to that for each further partner that has the place inside and has not matched it."""
 
 SURE_THOUGH_SEEN = 0.7
 """Confidence from which on a network's word alone stands where other frames have the place inside and match nothing."""
@@ -100,6 +100,7 @@ def frame_points(
     agree = np.zeros(depth.shape, np.uint8)
     taken = np.zeros(depth.shape, bool)
     visible = np.zeros(depth.shape, np.uint8)
+    partners = list(partners)
     for partner, other, before in partners:
         found, spread, given, theirs, inside = _look_up(own, depth, partner, other, before)
         visible += inside
@@ -114,9 +115,16 @@ def frame_points(
         total += w
         mean += np.where(same, w * found, 0)
     # One pair alone must at least agree with itself, seen from its other frame.
+    rows, columns = np.nonzero(np.isfinite(depth) & ~second & (agree == 0) & (data["support"] == 1) & (visible == 1))
+    places = unproject(
+        np.stack([columns + 0.5, rows + 0.5], 1), depth[rows, columns], own.camera, own.world_from_camera
+    )
+    for partner, other, _ in partners:
+        agree[rows, columns] |= _on_slope(places, sigma[rows, columns], partner, other)
     votes = np.maximum(agree, data["support"])
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
-    known &= guessed | (visible < SEEN_BY_MANY) | (data["support"] >= 2) | (data["score"] >= WORST_OF_ONE_PAIR)
+    enough = WORST_SCORE[False] + UNMATCHED * np.maximum(visible - 1.0, 0)
+    known &= guessed | (data["support"] >= 2) | (data["score"] >= enough)
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
         alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN)
@@ -172,6 +180,24 @@ def _look_up(
     # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
     inside = (third > 0) & (u > -0.5) & (v > -0.5) & (u < other.camera.width - 0.5) & (v < other.camera.height - 0.5)
     return there / third, spread / third, was, theirs, inside
+
+
+def _on_slope(places: Array, sigma: NDArray, other: DepthMap, data: Mapping[str, NDArray]) -> NDArray[np.bool_]:
+    """Which points [N, 3] lie between the depths that pairs have matched in the 3 x 3 pixels of another map round them.
+
+    On walls and crowns the depth changes from pixel to pixel by more than its standard deviation, and what was matched
+    from pixel to pixel in one frame leaves holes in the other.
+    """
+    pixels, depth = project(places, other.camera, other.world_from_camera)
+    with np.errstate(invalid="ignore"):
+        inside = (depth > 0) & ((pixels > 0) & (pixels < [other.camera.width, other.camera.height])).all(1)
+    columns, rows = np.where(inside[:, None], pixels, 0).astype(int).T
+    matched = np.where(data["second"], np.float32(np.nan), data["depth"]) if "second" in data else data["depth"]
+    around = np.pad(matched, 1, constant_values=np.nan), np.pad(data["sigma"], 1, constant_values=np.nan)
+    depths, spreads = (np.stack([m[rows + i, columns + j] for i in range(3) for j in range(3)]) for m in around)
+    spread = np.minimum(np.fmax.reduce(spreads), WIDEST * depth / other.camera.fx)
+    gate = GATE * np.hypot(np.minimum(sigma, WIDEST * depth / other.camera.fx), spread)
+    return inside & (depth > np.fmin.reduce(depths) - gate) & (depth < np.fmax.reduce(depths) + gate)
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -19,8 +19,9 @@ from overfly.mapping.views import Views
 SIDES = tuple(range(64, 193, 32))
 """Sides that the coarsest octave of a network's images may have, pixels."""
 
-OCTAVES = 2
-"""Octaves of detail over the coarsest: four times its width."""
+OCTAVES = 1
+"""Octaves of detail over the coarsest: twice its width. One more triples the network's time, and its surface is refined
+at full size anyway."""
 
 PER_FRAME = ("images", "intrinsics", "camera_from_window", "prior_from_window")
 """What a batch holds of each frame [B, K, ...] and a network looks at."""
