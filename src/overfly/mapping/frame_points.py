@@ -31,6 +31,9 @@ WIDEST = 2.0
 SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.7
 """Connected pieces of depth with fewer pixels are speckle; pieces up to the second size must correlate so well."""
 
+CONNECTED = 32
+"""Standard deviations that neighbouring pixels of a piece may be apart: 8 pixels of disparity, as on walls."""
+
 
 def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     """The map without badly correlated pixels and speckle."""
@@ -46,7 +49,7 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     steps = np.clip(np.where(known, (1 / np.where(known, depth, middle) - 1 / middle) / unit, -30000), -30000, 30000)
     for pixels, score in ((SPECK, np.inf), (ISLAND, ISLAND_SCORE)):
         labels = steps.astype(np.int16)
-        cv2.filterSpeckles(labels, -30000, pixels, 8)
+        cv2.filterSpeckles(labels, -30000, pixels, CONNECTED)
         known &= (labels > -30000) | (data["score"] >= score)
     depth = np.where(known, depth, np.float32(np.nan))
     opinion = depth_map.opinion()
