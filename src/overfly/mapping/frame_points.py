@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from overfly.cloud import Cloud
 from overfly.flights import Frame
-from overfly.geometry import Array, project, unproject
+from overfly.geometry import unproject
+from overfly.mapping.compared import Partner, compared
 from overfly.mapping.depth_map import DepthMap
-from overfly.mapping.subpixel import Map, frame_to_frame
-
-GATE = 3.0
-"""Two depths of one place agree within this many standard deviations of their difference."""
+from overfly.mapping.subpixel import Map
 
 WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
@@ -22,11 +20,9 @@ WORST_SCORE = {True: 0.2, False: 0.3}
 UNMATCHED = 0.15
 """What is added to that for each further partner that has the place inside and has not matched it."""
 
-SURE_THOUGH_SEEN = 0.7
-"""Confidence from which on a network's word alone stands where other frames have the place inside and match nothing."""
-
-WIDEST = 2.0
-"""Ground pixels: the largest standard deviation with which depths of one place are compared, whatever they promise."""
+SURE_THOUGH_SEEN, SURER = 0.7, 0.1
+"""Confidence from which on a network's word alone stands where another frame has the place inside and nothing is
+matched, and what is added for each further one."""
 
 SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.7
 """Connected pieces of depth with fewer pixels are speckle; pieces up to the second size must correlate so well."""
@@ -77,7 +73,7 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
 def frame_points(
     own: DepthMap,
     data: Mapping[str, NDArray],
-    partners: Iterable[tuple[DepthMap, Mapping[str, NDArray], NDArray[np.bool_] | None]],
+    partners: Iterable[Partner],
     frame: Frame,
     single: bool,
 ) -> tuple[Cloud, NDArray[np.bool_], NDArray[np.bool_], float]:
@@ -94,47 +90,20 @@ def frame_points(
         The points, which of them no pair has matched [N], which pixels are given now [H, W], and metres per pixel.
     """
     depth: Map = data["depth"]
-    sigma = data["sigma"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
     second = data.get("second", guessed)
-    widest = WIDEST * depth / own.camera.fx
-    weight = 1 / sigma**2
-    total, mean = weight.copy(), weight * depth
-    agree = np.zeros(depth.shape, np.uint8)
-    taken = np.zeros(depth.shape, bool)
-    visible = np.zeros(depth.shape, np.uint8)
-    partners = list(partners)
-    for partner, other, before in partners:
-        found, spread, given, theirs, inside = _look_up(own, depth, partner, other, before)
-        visible += inside
-        # What pairs have matched is judged by what pairs have matched alone: the cloud of them is that of stereo.
-        found = np.where(theirs & ~second, np.float32(np.nan), found)
-        with np.errstate(invalid="ignore"):
-            gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
-            same = np.abs(found - depth) < gate
-        agree += same
-        taken |= same & given
-        w = np.where(same, 1 / spread**2, 0)
-        total += w
-        mean += np.where(same, w * found, 0)
-    # One pair alone must at least agree with itself, seen from its other frame.
-    rows, columns = np.nonzero(np.isfinite(depth) & ~second & (agree == 0) & (data["support"] == 1) & (visible == 1))
-    places = unproject(
-        np.stack([columns + 0.5, rows + 0.5], 1), depth[rows, columns], own.camera, own.world_from_camera
-    )
-    for partner, other, _ in partners:
-        agree[rows, columns] |= _on_slope(places, sigma[rows, columns], partner, other)
-    votes = np.maximum(agree, data["support"])
+    seen = compared(own, data, second, list(partners))
+    agree = seen.agree
+    votes, more = np.maximum(agree, data["support"]), np.maximum(seen.visible - 1.0, 0)
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
-    enough = WORST_SCORE[False] + UNMATCHED * np.maximum(visible - 1.0, 0)
-    known &= guessed | (data["support"] >= 2) | (data["score"] >= enough)
+    known &= guessed | (data["support"] >= 2) | (data["score"] >= WORST_SCORE[False] + UNMATCHED * more)
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
-        alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN)
+        alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN + SURER * more)
     image, shown = _shown(frame, own)
     known = (known | alone) & shown
-    fresh = known & ~taken
-    merged, spread = mean[fresh] / total[fresh], 1 / np.sqrt(total[fresh])
+    fresh = known & ~seen.taken
+    merged = seen.depth[fresh]
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = unproject(pixels, merged, own.camera, own.world_from_camera)
@@ -147,60 +116,13 @@ def frame_points(
             data["sure"][fresh] if "sure" in data else 0,
             _confidence(votes, agree[fresh], data["score"][fresh]),
         ).astype(np.float32),
-        sigma_m=spread.astype(np.float32),
+        sigma_m=seen.sigma[fresh].astype(np.float32),
         views=(1 + votes).astype(np.uint8),
         predicted=alone[fresh],
     )
     measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
     gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
     return cloud, second[fresh], known, gsd
-
-
-def _look_up(
-    own: DepthMap, depth: Map, other: DepthMap, data: Mapping[str, NDArray], given: NDArray[np.bool_] | None
-) -> tuple[Map, Map, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """What another map says of each pixel: its depth as a depth of this frame, its sigma, whether it is given,
-    whether no pair has matched it there, and whether it lies inside that map at all."""
-    import cv2
-
-    q, t = frame_to_frame(own.camera, own.world_from_camera, other.camera, other.world_from_camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / depth
-        third = q[2] + inverse * t[2]
-        u = np.nan_to_num((q[0] + inverse * t[0]) / third - np.float32(0.5), nan=-9, posinf=-9, neginf=-9)
-        v = np.nan_to_num((q[1] + inverse * t[1]) / third - np.float32(0.5), nan=-9, posinf=-9, neginf=-9)
-    nan = float("nan")
-    there, spread = (
-        cv2.remap(data[name], u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=nan)
-        for name in ("depth", "sigma")
-    )
-    was, theirs = (
-        np.zeros(depth.shape, bool)
-        if mask is None
-        else cv2.remap(mask.astype(np.uint8), u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
-        for mask in (given, data.get("second"))
-    )
-    # third * depth is the depth in the other frame: their ratio is how much nearer or farther it saw the place.
-    inside = (third > 0) & (u > -0.5) & (v > -0.5) & (u < other.camera.width - 0.5) & (v < other.camera.height - 0.5)
-    return there / third, spread / third, was, theirs, inside
-
-
-def _on_slope(places: Array, sigma: NDArray, other: DepthMap, data: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Which points [N, 3] lie between the depths that pairs have matched in the 3 x 3 pixels of another map round them.
-
-    On walls and crowns the depth changes from pixel to pixel by more than its standard deviation, and what was matched
-    from pixel to pixel in one frame leaves holes in the other.
-    """
-    pixels, depth = project(places, other.camera, other.world_from_camera)
-    with np.errstate(invalid="ignore"):
-        inside = (depth > 0) & ((pixels > 0) & (pixels < [other.camera.width, other.camera.height])).all(1)
-    columns, rows = np.where(inside[:, None], pixels, 0).astype(int).T
-    matched = np.where(data["second"], np.float32(np.nan), data["depth"]) if "second" in data else data["depth"]
-    around = np.pad(matched, 1, constant_values=np.nan), np.pad(data["sigma"], 1, constant_values=np.nan)
-    depths, spreads = (np.stack([m[rows + i, columns + j] for i in range(3) for j in range(3)]) for m in around)
-    spread = np.minimum(np.fmax.reduce(spreads), WIDEST * depth / other.camera.fx)
-    gate = GATE * np.hypot(np.minimum(sigma, WIDEST * depth / other.camera.fx), spread)
-    return inside & (depth > np.fmin.reduce(depths) - gate) & (depth < np.fmax.reduce(depths) + gate)
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
