@@ -29,7 +29,8 @@ OUTLIER, ROUNDS = 0.005, 6
 are weighed anew: a roof or a wood beside a gap says little of the ground in it."""
 
 ABOVE = 4.0
-"""How much more a cell over the plate is taken to miss it than one under it: what stands on the ground is over it."""
+"""How much more a cell over the plate is taken to miss it than one under it: what stands on the ground is over it. The
+price: wrong cells below the ground pull it down; 15 % of them, 15 m too low, by 2.6 m."""
 
 TALL = 0.05
 """Share of the camera's height over the surface by which something must rise over its surroundings to be believed."""
@@ -83,7 +84,7 @@ def _cells(measured: Map, size: int) -> tuple[NDArray[np.float64], NDArray[np.fl
 
 
 def _plate(medians: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The thin plate [rows, columns] through weighted values, those that miss it weighed less (Huber's weights)."""
+    """The thin plate [rows, columns] through weighted values; those that miss it weigh less (Huber), above sooner."""
     from scipy.sparse import csr_array, diags_array, eye_array, kron
     from scipy.sparse.linalg import spsolve
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.geometry import Array, project, unproject
+from overfly.geometry import project, unproject
 from overfly.mapping.depth_map import DepthMap
 from overfly.mapping.subpixel import Map, frame_to_frame
 
@@ -28,7 +28,8 @@ class Compared:
 
     Attributes:
         depth, sigma: weighted mean of the depths that agree and its standard deviation, metres.
-        agree: partners that have measured the same place.
+        agree: partners whose depth there is the same.
+        slope: whether the only partner that has the place inside has it between the depths of neighbouring pixels.
         taken: whether one of them has given the place already.
         visible: partners that have the place inside.
     """
@@ -36,14 +37,15 @@ class Compared:
     depth: NDArray
     sigma: NDArray
     agree: NDArray[np.uint8]
+    slope: NDArray[np.bool_]
     taken: NDArray[np.bool_]
     visible: NDArray[np.uint8]
 
 
 def compared(
-    own: DepthMap, data: Mapping[str, NDArray], second: NDArray[np.bool_], partners: Sequence[Partner]
+    own: DepthMap, data: Mapping[str, NDArray], second: NDArray[np.bool_], partners: Iterable[Partner]
 ) -> Compared:
-    """Look up every pixel of a map in those of its partners.
+    """Look up every pixel of a map in those of its partners, one of which is in memory at a time.
 
     Args:
         own, data: the map and its cleaned content.
@@ -55,7 +57,8 @@ def compared(
     weight = 1 / sigma**2
     total, mean = weight.copy(), weight * depth
     agree, visible = np.zeros(depth.shape, np.uint8), np.zeros(depth.shape, np.uint8)
-    taken = np.zeros(depth.shape, bool)
+    taken, slope, given_there = (np.zeros(depth.shape, bool) for _ in range(3))
+    one_pair = np.isfinite(depth) & ~second & (data["support"] == 1)
     for partner, other, before in partners:
         found, spread, given, theirs, inside = _look_up(own, depth, partner, other, before)
         visible += inside
@@ -69,13 +72,13 @@ def compared(
         w = np.where(same, 1 / spread**2, 0)
         total += w
         mean += np.where(same, w * found, 0)
-    # One pair alone must at least agree with itself, seen from its other frame.
-    rows, columns = np.nonzero(np.isfinite(depth) & ~second & (agree == 0) & (data["support"] == 1) & (visible == 1))
-    pixels = np.stack([columns + 0.5, rows + 0.5], 1)
-    places = unproject(pixels, depth[rows, columns], own.camera, own.world_from_camera)
-    for partner, other, _ in partners:
-        agree[rows, columns] |= _on_slope(places, sigma[rows, columns], partner, other)
-    return Compared(mean / total, 1 / np.sqrt(total), agree, taken, visible)
+        doubtful = one_pair & inside & (visible == 1) & (agree == 0)
+        slope[doubtful] = _on_slope(own, depth, np.minimum(sigma, widest), doubtful, partner, other)
+        given_there |= doubtful & given & ~theirs
+    # Where more than one could see the place, one whose neighbouring pixels allow it proves nothing.
+    slope &= (visible == 1) & (agree == 0)
+    taken |= slope & given_there
+    return Compared(mean / total, 1 / np.sqrt(total), agree, slope, taken, visible)
 
 
 def _look_up(
@@ -107,19 +110,38 @@ def _look_up(
     return there / third, spread / third, was, theirs, inside
 
 
-def _on_slope(places: Array, sigma: NDArray, other: DepthMap, data: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Which points [N, 3] lie between the depths that pairs have matched in the 3 x 3 pixels of another map round them.
+def _on_slope(
+    own: DepthMap, depth: Map, sigma: NDArray, asked: NDArray[np.bool_], other: DepthMap, data: Mapping[str, NDArray]
+) -> NDArray[np.bool_]:
+    """Which of the asked pixels lie between the depths that pairs have matched in 3 x 3 pixels of another map.
 
     On walls and crowns the depth changes from pixel to pixel by more than its standard deviation, and what was matched
-    from pixel to pixel in one frame leaves holes in the other.
+    from pixel to pixel in one frame leaves holes in the other. The price: what floats between a roof's edge and the
+    ground passes, too.
+
+    Args:
+        own, depth, sigma: the map, its depth and standard deviation [H, W], metres.
+        asked: pixels [H, W] that the other map has inside.
+        other, data: the other map and its cleaned content.
     """
-    pixels, depth = project(places, other.camera, other.world_from_camera)
-    with np.errstate(invalid="ignore"):
-        inside = (depth > 0) & ((pixels > 0) & (pixels < [other.camera.width, other.camera.height])).all(1)
-    columns, rows = np.where(inside[:, None], pixels, 0).astype(int).T
-    matched = np.where(data["second"], np.float32(np.nan), data["depth"]) if "second" in data else data["depth"]
-    around = np.pad(matched, 1, constant_values=np.nan), np.pad(data["sigma"], 1, constant_values=np.nan)
-    depths, spreads = (np.stack([m[rows + i, columns + j] for i in range(3) for j in range(3)]) for m in around)
-    spread = np.minimum(np.fmax.reduce(spreads), WIDEST * depth / other.camera.fx)
-    gate = GATE * np.hypot(np.minimum(sigma, WIDEST * depth / other.camera.fx), spread)
-    return inside & (depth > np.fmin.reduce(depths) - gate) & (depth < np.fmax.reduce(depths) + gate)
+    rows, columns = np.nonzero(asked)
+    if not len(rows):
+        return np.zeros(0, bool)
+    pixels = np.stack([columns + 0.5, rows + 0.5], 1)
+    places = unproject(pixels, depth[asked], own.camera, own.world_from_camera)
+    found, there = project(places, other.camera, other.world_from_camera)
+    scale = there / depth[asked]
+    u, v = np.clip(found.astype(int), 0, [other.camera.width - 1, other.camera.height - 1]).T
+    matched = np.isfinite(data["depth"]) & ~data.get("second", np.zeros_like(asked))
+    low, high, widest = np.full(len(rows), np.inf), np.full(len(rows), -np.inf), np.zeros(len(rows))
+    height, width = matched.shape
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            at = np.clip(v + i, 0, height - 1), np.clip(u + j, 0, width - 1)
+            known = matched[at]
+            low = np.where(known, np.minimum(low, data["depth"][at]), low)
+            high = np.where(known, np.maximum(high, data["depth"][at]), high)
+            widest = np.where(known, np.maximum(widest, data["sigma"][at]), widest)
+    most = WIDEST * depth[asked] / own.camera.fx
+    gate = GATE * np.hypot(sigma[asked], np.minimum(widest / scale, most)) * scale
+    return np.asarray((there > low - gate) & (there < high + gate))

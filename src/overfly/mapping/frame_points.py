@@ -22,7 +22,7 @@ UNMATCHED = 0.15
 
 SURE_THOUGH_SEEN, SURER = 0.7, 0.1
 """Confidence from which on a network's word alone stands where another frame has the place inside and nothing is
-matched, and what is added for each further one."""
+matched, and what is added for each further one: against four it never stands."""
 
 SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.7
 """Connected pieces of depth with fewer pixels are speckle; pieces up to the second size must correlate so well."""
@@ -92,14 +92,18 @@ def frame_points(
     depth: Map = data["depth"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
     second = data.get("second", guessed)
-    seen = compared(own, data, second, list(partners))
+    seen = compared(own, data, second, partners)
     agree = seen.agree
-    votes, more = np.maximum(agree, data["support"]), np.maximum(seen.visible - 1.0, 0)
-    known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | (data["support"] >= 2))
-    known &= guessed | (data["support"] >= 2) | (data["score"] >= WORST_SCORE[False] + UNMATCHED * more)
+    # Partners that have the place inside and say nothing, or something else, beyond the one that every pair leaves out.
+    silent = np.maximum(seen.visible.astype(np.int8) - np.maximum(agree, 1), 0)
+    votes = np.maximum(agree, data["support"])
+    several = data["support"] >= 2
+    known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | seen.slope | several)
+    # Scores are whole hundredths.
+    known &= guessed | several | (data["score"] > WORST_SCORE[False] + UNMATCHED * silent - 0.005)
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
-        alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN + SURER * more)
+        alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN + SURER * silent)
     image, shown = _shown(frame, own)
     known = (known | alone) & shown
     fresh = known & ~seen.taken

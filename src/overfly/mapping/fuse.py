@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from overfly.errors import Damaged, InputError
 from overfly.files import load_arrays, save_arrays
 from overfly.flights import Frame
+from overfly.mapping.compared import Partner
 from overfly.mapping.depth_map import DepthMap
 from overfly.mapping.frame_points import cleaned, frame_points
 from overfly.mapping.layout import Layout, laid_out, reach
@@ -152,7 +153,7 @@ class _Fusion:
             guesses.append(records[guessed & within(at, low, high)])
         return np.concatenate(matched), np.concatenate(guesses)
 
-    def _partners(self, k: int) -> Iterator[tuple[DepthMap, dict[str, NDArray], NDArray[np.bool_] | None]]:
+    def _partners(self, k: int) -> Iterator[Partner]:
         for name in self.maps[k].partners:
             if (j := self.index.get(name)) is not None:
                 yield self.maps[j], self.load(j), self.given(j) if j < k else None

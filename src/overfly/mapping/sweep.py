@@ -20,8 +20,8 @@ SIDES = tuple(range(64, 193, 32))
 """Sides that the coarsest octave of a network's images may have, pixels."""
 
 OCTAVES = 1
-"""Octaves of detail over the coarsest: twice its width. One more triples the network's time, and its surface is refined
-at full size anyway."""
+"""Octaves of detail over the coarsest. A second one takes three times as long, and F-scores of flights are the same:
+what several frames see is refined at full size anyway, and what one sees is carried on from what is measured."""
 
 PER_FRAME = ("images", "intrinsics", "camera_from_window", "prior_from_window")
 """What a batch holds of each frame [B, K, ...] and a network looks at."""
