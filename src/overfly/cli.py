@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -136,7 +136,10 @@ def map_(
         ),
     ] = None,
     cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
-    matcher: Annotated[str, typer.Option(help="Of key points: sift, encoder (of the network) or both.")] = "sift",
+    matcher: Annotated[
+        str,
+        typer.Option(help="Of key points: sift, encoder (of the network), both, or auto: sift, and both if in need."),
+    ] = "auto",
     control: Annotated[
         str, typer.Option(help="Points of gcp_list.txt: split (a quarter only checks), all, or none.")
     ] = "split",
@@ -165,15 +168,17 @@ def map_(
     """Photographs in, map out: coloured cloud, height raster, orthophoto and report."""
     from overfly.mapping.map import map_flight
 
-    run = None
-    if dense == "sweep" or matcher != "sift":
+    def load() -> Any:
         from overfly.shipped import load_network
 
-        run = load_network(network)
+        return load_network(network)
+
+    # Where it is sure to be needed, or was named, a wrong name is told at once.
+    at_once = dense == "sweep" or matcher in ("encoder", "both") or network is not None
     map_flight(
         flight,
         out=out,
-        network=run,
+        network=load() if at_once else load,
         network_name=network or "shipped",
         cameras=cameras,
         matcher=matcher,

@@ -143,7 +143,7 @@ def test_cameras_from_the_encoders_matches(  # type: ignore[no-untyped-def]
     monkeypatch.setattr("overfly.mapping.features.FEATURES", 600)
     poses = [*strips[:2], *strips[6:]]
     flight = hill.flight(tmp_path, camera, poses)
-    block = align(flight, workdir=tmp_path / "work", seed=0, bar=bar, matcher=matcher, encoder=encoder)
+    block = align(flight, workdir=tmp_path / "work", seed=0, bar=bar, matcher=matcher, encoder=lambda: encoder)
     assert len(block.frames) == 4
     assert block.metric
     assert block.reprojection_px < 0.5

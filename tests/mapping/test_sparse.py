@@ -86,3 +86,48 @@ def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_neede
     assert bool(warnings) == (taken == "prior")
     if warnings:
         assert ("contradicted GPS" in warnings[0]) == (held is not None and not agrees)
+
+
+@pytest.mark.parametrize(
+    ("few", "many", "taken", "priors_of"),
+    [
+        (Part("few", 12), Part("many", 20), "many", None),
+        (None, Part("many", 20), "many", None),
+        (Part("few", 18), Part("many", 12), "prior", "many.db"),  # still too few: the priors have all matches
+        (Part("few", 20), None, "few", None),  # nothing more is asked for
+    ],
+)
+def test_more_matches_are_asked_for_where_they_are_too_few(
+    few: Part | None,
+    many: Part | None,
+    taken: str,
+    priors_of: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    read: list[str] = []
+    by_database = {"few.db": few, "many.db": many}
+    monkeypatch.setattr(
+        sparse, "mapped", lambda database, *_, **__: [p] if (p := by_database[database.name]) is not None else []
+    )
+    monkeypatch.setattr(sparse, "bundle_of", lambda model, _: model)
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: True)
+    monkeypatch.setattr(sparse, "read_points", lambda database, _: (read.append(database.name), []))
+    monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
+    monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: PRIOR)
+    monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
+    flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(20)])
+    warnings: list[str] = []
+    asked: list[str] = []
+
+    def more() -> Path:
+        asked.append("more")
+        return tmp_path / "many.db"
+
+    parts: Any = sparse.sparse_parts(
+        tmp_path / "few.db", flight, [], np.zeros((20, 3)), tmp_path, 0,
+        lambda *_: nullcontext(lambda *_: None), warnings, more,
+    )  # fmt: skip
+    assert [part.name for part in parts] == [taken]
+    assert read == ([] if priors_of is None else [priors_of])
+    assert bool(asked) == bool(warnings) == (taken != "few")

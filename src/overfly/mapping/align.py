@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def align(
     seed: int,
     bar: Bar,
     matcher: str = "sift",
-    encoder: Encoder | None = None,
+    encoder: Callable[[], Encoder] | None = None,
     control: str = "split",
 ) -> Block:
     """Estimate the cameras of a flight.
@@ -54,8 +54,8 @@ def align(
         workdir: features, matches and the sparse models are kept here, and reused.
         seed: of every random choice; the same seed gives the same cameras.
         bar: (step, unit) -> context manager of a function that takes (done, total).
-        matcher: what finds the key points: "sift", "encoder" or "both".
-        encoder: of a trained network; not needed by "sift".
+        matcher: what finds the key points: "sift", "encoder", "both", or "auto": both where SIFT's matches are too few.
+        encoder: loads that of a trained network; not needed by "sift", and by "auto" only where it is asked.
         control: what the flight's ground control points do: "split" keeps a quarter as check points, "all" puts all
             of them into the adjustment, "none" leaves them aside.
 
@@ -79,7 +79,13 @@ def align(
     workdir.mkdir(parents=True, exist_ok=True)
     warnings: list[str] = []
     origin, told = gps_frame(flight)
-    database, guessed = matched(flight, told, workdir, matcher=matcher, encoder=encoder, seed=seed, bar=bar)
+
+    def matches_by(how: str) -> tuple[Path, list[str]]:
+        network = encoder() if encoder is not None and how != "sift" else None
+        return matched(flight, told, workdir, matcher=how, encoder=network, seed=seed, bar=bar)
+
+    database, guessed = matches_by("sift" if matcher == "auto" else matcher)
+    more = (lambda: matches_by("both")[0]) if matcher == "auto" and encoder is not None else None
     if guessed:
         warnings.append(
             f"The focal length of {len(guessed)} images is not known and was estimated from the images alone: "
@@ -88,7 +94,7 @@ def align(
     with bar("cameras", "models") as update:
         # Small matrices gain nothing by more threads, and their sums would depend on the machine.
         with threadpool_limits(1, user_api="blas"):
-            parts = sparse_parts(database, flight, guessed, told, workdir, seed, bar, warnings)
+            parts = sparse_parts(database, flight, guessed, told, workdir, seed, bar, warnings, more)
         update(1, 2)
         if not parts:
             raise InputError(

@@ -24,7 +24,7 @@ from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles, write_tiles
 
-BLOCK_FORM, DENSE_FORM = 10, 8
+BLOCK_FORM, DENSE_FORM = 11, 8
 """Of what the steps keep, half-finished parts included: raised whenever the same images and settings become another
 block, or the same block another cloud, so that a map resumed from an older version's folder mixes nothing."""
 
@@ -110,7 +110,7 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
     check_place(flight, asked.heights, estimate=estimate, control=asked.control)
     steps.say("images", _about(flight))
     ruled = [asked.control] if flight.gcps and asked.control != "split" else []
-    matched = [asked.seed, *ruled, *([] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)])]
+    matched = [asked.seed, *ruled, *_matcher_key(asked)]
     key = key_of(__version__, BLOCK_FORM, identity, estimate, matched if estimate else None)
     block = steps.kept(
         "cameras",
@@ -166,7 +166,10 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
     """Cameras estimated from the images."""
     from overfly.mapping.align import align
 
-    encoder = asked.network.network.encoder if asked.network is not None and asked.matcher != "sift" else None
+    def encoder() -> Any:
+        assert asked.run is not None
+        return asked.run.network.encoder
+
     return checked(
         align(
             flight,
@@ -174,7 +177,7 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
             seed=asked.seed,
             bar=steps.bar,
             matcher=asked.matcher,
-            encoder=encoder,
+            encoder=None if asked.network is None else encoder,
             control=asked.control,
         ),
         flight,
@@ -188,7 +191,7 @@ def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) 
 
 def sweep_cloud(block: Block, flight: Flight, scratch: Path, asked: MapSettings, steps: Steps) -> Tiles:
     """The dense cloud by the trained network, in the block's frame."""
-    run = asked.network
+    run = asked.run
     assert run is not None
     if getattr(run.network, "predicts_surfaces", False):
         from overfly.mapping.sweep import SweepOpinions
@@ -277,13 +280,20 @@ def _how(asked: MapSettings) -> str:
     return "semi-global stereo" if asked.dense == "stereo" else f"the network {asked.network_name or ''}".strip()
 
 
+def _matcher_key(asked: MapSettings) -> list[Any]:
+    """What cameras depend on besides the images: "auto" goes by the network's name, since it is seldom loaded."""
+    if asked.matcher == "auto":
+        return ["auto", asked.network_name]
+    return [] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)]
+
+
 def _network_key(asked: MapSettings) -> Any:
     """What a trained run's answer depends on: its weights."""
     import hashlib
 
     digest = hashlib.sha256()
-    assert asked.network is not None
-    for name, value in asked.network.network.state_dict().items():
+    assert asked.run is not None
+    for name, value in asked.run.network.state_dict().items():
         digest.update(name.encode())
         digest.update(value.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -32,7 +32,7 @@ Bar = Callable[[str, str], AbstractContextManager[Callable[..., Any]]]
 Pairs = list[tuple[int, int]]
 Matches = dict[tuple[int, int], NDArray[np.uint32]]
 
-MATCHERS = ("sift", "encoder", "both")
+MATCHERS = ("auto", "sift", "encoder", "both")
 
 PICTURES = 24
 """Frames that are held in memory at once."""

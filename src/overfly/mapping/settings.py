@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from overfly.errors import InputError, unknown
@@ -31,12 +33,13 @@ class MapSettings:
 
     Attributes:
         cameras: "given" takes those of the flight folder, "estimate" ignores them, "auto" takes them if there are any.
-        matcher: what finds the key points from which cameras are estimated: "sift", the network's "encoder", or "both".
+        matcher: what finds the key points from which cameras are estimated: "sift", the network's "encoder", "both", or
+            "auto": SIFT, and both where its matches are too few to place the images.
         control: what ground control points do: "split" keeps a quarter of four or more to check the map, "all" lets all
             hold it, "none" leaves them aside.
         dense: "sweep" by a trained network, "stereo" by semi-global matching of rectified pairs.
-        network: the trained run (``overfly.run.load_run``); needed by "sweep" and by the matcher
-            "encoder", unused by "stereo" and "sift".
+        network: the trained run (``overfly.run.load_run``) or what loads it; needed by "sweep" and by the matchers
+            "encoder" and "both"; without it "auto" has SIFT alone.
         network_name: what the user called it.
         max_memory_gb: memory that the dense step and the products may take; None: half of what is free, at most 6.
         resume: reuse finished steps of an earlier map of the same images with the same settings.
@@ -53,10 +56,10 @@ class MapSettings:
     """
 
     cameras: str = "auto"
-    matcher: str = "sift"
+    matcher: str = "auto"
     control: str = "split"
     dense: str = "sweep"
-    network: TrainedRun | None = None
+    network: TrainedRun | Callable[[], TrainedRun] | None = None
     network_name: str | None = None
     max_memory_gb: float | None = None
     resume: bool = True
@@ -83,7 +86,7 @@ class MapSettings:
                 "The dense step sweep needs a trained network: give --network RUN (a run folder of train.py), "
                 "or map without one by --dense stereo."
             )
-        if self.matcher != "sift" and self.network is None:
+        if self.matcher in ("encoder", "both") and self.network is None:
             raise InputError(
                 f"The matcher {self.matcher} needs a trained network: give --network RUN (a run folder of train.py), "
                 "or match without one by --matcher sift."
@@ -111,6 +114,11 @@ class MapSettings:
                 f"--max-memory {self.max_memory_gb:g}: allow so much, or give fewer --mesh-faces."
             )
 
+    @cached_property
+    def run(self) -> TrainedRun | None:
+        """The trained run, loaded when it is first asked for."""
+        return self.network() if callable(self.network) else self.network
+
     def shown(self) -> dict[str, Any]:
         """For the report and map.json."""
         return {
@@ -119,7 +127,7 @@ class MapSettings:
             "matcher": self.matcher,
             "control": self.control,
             "heights": self.heights,
-            "network": self.network_name if self.dense == "sweep" or self.matcher != "sift" else None,
+            "network": self.network_name if self.dense == "sweep" or self.matcher in ("encoder", "both") else None,
             "max_memory_gb": self.max_memory_gb,
             "size": self.size,
             "seed": self.seed,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +32,14 @@ def sparse_parts(
     seed: int,
     bar: Bar,
     warnings: list[str],
+    more: Callable[[], Path] | None = None,
 ) -> list[Bundle]:
     """Bundles without common images, the largest first: with the focal lengths that the photos tell, if they tell them.
 
     Over flat ground a focal length without limits may run away, and everything with it; it is let go only where not
     all images could be placed with the one that is told. Where matches are so few that sparse mapping leaves images
-    out or contradicts GPS, cameras start where GPS and gimbals say that they are.
+    out or contradicts GPS, more of them are asked for; if these are too few as well, cameras start where GPS and
+    gimbals say that they are.
 
     Args:
         database: of verified matches.
@@ -48,6 +50,7 @@ def sparse_parts(
         seed: of the mapping.
         bar: (step, unit) -> context manager of a function that takes (done, total).
         warnings: for the user.
+        more: makes a database of more matches.
     """
     names = [frame.name for frame in flight.frames]
     numbers = {name: i for i, name in enumerate(names)}
@@ -56,15 +59,32 @@ def sparse_parts(
         models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
         return [bundle_of(model, numbers) for model in models]
 
-    best = [] if len(guessed) == len(names) else found(workdir / "held", calibrate=False)
-    if not (best and len(best[0]) == len(names)):
-        free = found(workdir, calibrate=True)
-        best = free if not best or (free and len(free[0]) > len(best[0])) else best
-    if told is None:
-        return best
-    placed = len(best[0]) if best else 0
-    agrees = bool(best) and agrees_with_gps(best[0], told)
-    if agrees and placed >= ENOUGH * len(names):
+    def built_up(folder: Path) -> list[Bundle]:
+        held = [] if len(guessed) == len(names) else found(folder / "held", calibrate=False)
+        if held and len(held[0]) == len(names):
+            return held
+        free = found(folder, calibrate=True)
+        return free if not held or (free and len(free[0]) > len(held[0])) else held
+
+    def judged(parts: list[Bundle]) -> tuple[bool, bool]:
+        """Whether parts agree with GPS, as far as it is known, and whether they are good enough."""
+        agree = bool(parts) and (told is None or agrees_with_gps(parts[0], told))
+        return agree, agree and len(parts[0]) >= ENOUGH * len(names)
+
+    best = built_up(workdir)
+    agrees, good = judged(best)
+    if not good and more is not None:
+        database = more()
+        richer = built_up(workdir / "more")
+        if richer and (not best or judged(richer)[1] or _better(richer[0], best[0], agrees)):
+            best = richer
+            agrees, good = judged(best)
+        if good:
+            warnings.append(
+                "SIFT found so few matches that sparse mapping failed, and correspondences of the network were added: "
+                "fly with more overlap, and look at the picture of the block."
+            )
+    if good or told is None:
         return best
     features, lens_ids = read_points(database, names)
     with bar("guided matches", "pairs") as update:
@@ -74,7 +94,8 @@ def sparse_parts(
     parts = [] if prior is None else components(prior)
     if not parts or (best and not _better(parts[0], best[0], agrees)):
         return best
-    failed = "contradicted GPS" if best and not agrees else f"left out {len(names) - placed} of {len(names)} images"
+    left = len(names) - (len(best[0]) if best else 0)
+    failed = "contradicted GPS" if best and not agrees else f"left out {left} of {len(names)} images"
     warnings.append(
         f"Matches were so few that sparse mapping {failed}: the cameras were started where GPS and gimbals say that "
         "they are, and are only roughly held by the images. Fly with more overlap."
