@@ -21,7 +21,7 @@ def test_a_slope_measured_around_a_gap_is_carried_into_it() -> None:
     true, houses = landscape()
     measured = true.copy()
     measured[30:60, 40:80] = np.nan
-    found = anchored(houses, measured)
+    found, _ = anchored(houses, measured)
     gap = np.isnan(measured)
     assert np.abs(houses - true)[gap].mean() > 2.0
     assert np.abs(found - true)[gap].mean() < 0.6
@@ -38,8 +38,8 @@ def test_the_height_of_the_ground_is_not_the_suggestion_s_to_tell() -> None:
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     drifting = houses + 8 * np.exp(-((u - 60) ** 2 + (v - 45) ** 2) / 2 / 30**2)
     gap = np.isnan(measured)
-    assert np.abs(anchored(drifting, measured) - true)[gap].mean() < 0.8
-    far = anchored(drifting - 100, measured - 100) + 100  # from far above only what is tall is believed
+    assert np.abs(anchored(drifting, measured)[0] - true)[gap].mean() < 0.8
+    far = anchored(drifting - 100, measured - 100)[0] + 100  # from far above only what is tall is believed
     assert np.abs(far - true)[gap].mean() < 0.8
 
 
@@ -48,7 +48,7 @@ def test_the_plate_carries_a_slope_on_beyond_the_last_measured_place() -> None:
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     slope = 0.1 * u + 0.05 * v - 100
     measured = np.where(u < 90, slope, np.nan).astype(np.float32)
-    found = anchored(np.zeros_like(houses), measured)
+    found, _ = anchored(np.zeros_like(houses), measured)
     level = np.abs(slope[:, 89:90] - slope)[:, 90:].mean()  # what the last height, carried on, would be wrong by
     assert np.abs(found - slope)[:, 90:].mean() < 0.5 * level
 
@@ -57,16 +57,36 @@ def test_outliers_do_not_pull() -> None:
     true, houses = landscape()
     measured = true.copy()
     measured[:, ::3] += 40.0  # a third of the matches are wrong
-    assert np.abs(anchored(houses, measured) - true).mean() < 0.6
+    assert np.abs(anchored(houses, measured)[0] - true).mean() < 0.6
 
 
 @pytest.mark.parametrize("shape", [(4, 120), (6, 120), (120, 1), (1, 1)])
 def test_a_strip_of_one_or_two_cells_has_a_plate_too(shape: tuple[int, int]) -> None:
     measured = np.full(shape, -50, np.float32)
     measured[-shape[0] // 3 :, -shape[1] // 3 :] = np.nan if max(shape) > 1 else -50
-    np.testing.assert_allclose(anchored(np.full(shape, -40, np.float32), measured), -50, atol=1e-2)
+    np.testing.assert_allclose(anchored(np.full(shape, -40, np.float32), measured)[0], -50, atol=1e-2)
 
 
 def test_without_measurements_the_suggestion_stands() -> None:
     _, houses = landscape()
-    np.testing.assert_array_equal(anchored(houses, np.full_like(houses, np.nan)), houses)
+    found, sure = anchored(houses, np.full_like(houses, np.nan))
+    np.testing.assert_array_equal(found, houses)
+    assert sure is None
+
+
+def test_what_is_far_from_anything_measured_or_beside_rough_land_is_less_sure() -> None:
+    flat = np.full((HEIGHT, WIDTH), -100, np.float32)
+    measured = flat.copy()
+    measured[:, 50:] = np.nan
+    nothing = np.zeros_like(flat)
+    level = anchored(nothing, measured)[1]
+    rough = anchored(nothing, measured + 4 * np.random.default_rng(0).standard_normal(flat.shape).astype(np.float32))[1]
+    tower = nothing.copy()
+    tower[40:50, 70:80] = 20
+    stands = anchored(tower, measured)[1]
+    assert level is not None
+    assert rough is not None
+    assert stands is not None
+    assert level[:, 55].min() > 0.8 > level[:, 110].max() > 0.3
+    assert (rough[:, 55:75] < level[:, 55:75] - 0.2).all()
+    assert stands[45, 75] < level[45, 75] - 0.3

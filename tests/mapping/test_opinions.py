@@ -11,13 +11,14 @@ import pytest
 import torch
 from PIL import Image
 
+from overfly.files import save_arrays
 from overfly.flights import Frame
 from overfly.geometry import Camera, pixel_grid, rays
 from overfly.mapping.depth_map import DepthMap, Opinion
-from overfly.mapping.frame_points import frame_points
+from overfly.mapping.frame_points import cleaned, frame_points
 from overfly.mapping.fuse import fuse
 from overfly.mapping.stereo import stereo
-from overfly.mapping.sweep import SweepOpinions, octave_camera
+from overfly.mapping.sweep import SIDES, SweepOpinions, octave_camera
 from overfly.mapping.views import Views
 
 GROUND, ABOVE, SIGMA = -3.0, 5.0, 0.7
@@ -103,7 +104,7 @@ def test_what_pairs_have_measured_tells_the_ground_best(hill, strips, camera, tm
 def test_a_network_sees_whole_pictures_hardly_stretched(shape) -> None:  # type: ignore[no-untyped-def]
     camera = Camera(*shape, 3000.0, 3000.0, shape[0] / 2, shape[1] / 2)
     small = octave_camera(camera, (128, 96))
-    assert small.width % 64 == small.height % 64 == 0  # an octave over multiples of 32
+    assert {small.width // 2, small.height // 2} <= set(SIDES)  # an octave over what the network takes
     assert 0.85 < small.fx / small.fy < 1.18
     assert small.fov_deg == pytest.approx(camera.fov_deg)
 
@@ -142,9 +143,11 @@ def test_where_nothing_matches_the_networks_word_stands_and_is_marked(hill, stri
     assert cloud.views[cloud.predicted].max() == 1
 
 
-@pytest.mark.parametrize(("sure", "share"), [(0.5, 0.5), (0.8, 1.0)])
-def test_a_word_alone_must_be_surer_where_other_frames_see_the_place_too(
-    camera: Camera, sure: float, share: float, tmp_path: Path
+@pytest.mark.parametrize(
+    ("others", "sure", "share"), [(1, 0.5, 0.5), (1, 0.75, 1.0), (2, 0.75, 0.5), (2, 0.85, 1.0), (4, 0.99, 0.5)]
+)
+def test_a_word_alone_must_be_surer_the_more_other_frames_see_the_place(
+    camera: Camera, others: int, sure: float, share: float, tmp_path: Path
 ) -> None:
     """What other frames have inside and could not match is mostly wood and water, where networks err, too."""
     shape = camera.height, camera.width
@@ -159,7 +162,8 @@ def test_a_word_alone_must_be_surer_where_other_frames_see_the_place_too(
     own = DepthMap("a", camera, np.eye(4), [], tmp_path / "a.npz")
     frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
     Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
-    cloud, *_ = frame_points(own, data, [], frame, single=True)
+    silent = data | {"depth": np.full(shape, np.nan, np.float32)}
+    cloud, *_ = frame_points(own, data, [(own, silent, None)] * others, frame, single=True)
     assert cloud.predicted is not None
     assert cloud.predicted.all()
     assert len(cloud) == pytest.approx(share * once.size, abs=camera.height)
@@ -183,7 +187,7 @@ def test_no_point_comes_from_where_the_lens_has_shown_nothing(camera: Camera, tm
 
 
 @pytest.mark.parametrize(
-    ("partners", "score", "kept"), [(1, 0.35, True), (2, 0.35, False), (2, 0.5, True), (3, 0.5, False)]
+    ("partners", "score", "kept"), [(1, 0.35, True), (2, 0.35, False), (2, 0.45, True), (3, 0.5, False)]
 )
 def test_a_pair_alone_must_correlate_better_where_more_partners_see_the_place(
     camera: Camera, partners: int, score: float, kept: bool, tmp_path: Path
@@ -207,7 +211,7 @@ def test_a_wall_that_two_frames_alone_see_stands_though_its_depth_changes_from_p
     """Between the depths of two neighbouring pixels of the other frame lies what the first one sees of the wall."""
     shape = camera.height, camera.width
     blank = {"sigma": np.full(shape, 0.01, np.float32), "support": np.ones(shape, np.uint8)}
-    wall = np.full(shape, 50, np.float32) + 2 * (np.arange(camera.width) % 2).astype(np.float32)  # of two columns each
+    wall = np.full(shape, 50, np.float32) + 2 * (np.arange(camera.width) % 2).astype(np.float32)
     data = blank | {"depth": np.full(shape, 51, np.float32), "score": np.full(shape, 0.9, np.float32)}
     own, other = (DepthMap(name, camera, np.eye(4), [], tmp_path / f"{name}.npz") for name in ("a", "b"))
     frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
@@ -218,3 +222,39 @@ def test_a_wall_that_two_frames_alone_see_stands_though_its_depth_changes_from_p
     assert len(cloud) == (camera.width * camera.height if kept else 0)
     off = [(other, data | {"depth": wall + 4}, None)]
     assert not len(frame_points(own, data, off, frame, single=True)[0])
+
+
+@pytest.mark.parametrize("partners", [1, 3])
+def test_partners_that_confirm_a_place_do_not_count_against_it(camera: Camera, partners: int, tmp_path: Path) -> None:
+    shape = camera.height, camera.width
+    data = {"sigma": np.full(shape, 0.1, np.float32), "support": np.ones(shape, np.uint8)}
+    data |= {"depth": np.full(shape, 50, np.float32), "score": np.full(shape, 0.35, np.float32)}
+    own = DepthMap("a", camera, np.eye(4), [], tmp_path / "a.npz")
+    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
+    Image.fromarray(np.full((*shape, 3), 200, np.uint8)).save(frame.path)
+    cloud, *_ = frame_points(own, data, [(own, data, None)] * partners, frame, single=True)
+    assert len(cloud) == camera.width * camera.height
+
+
+@pytest.mark.parametrize(("step", "kept"), [(4, True), (12, False)])
+def test_a_sliver_of_wall_is_one_piece_where_its_depth_changes_by_a_few_pixels(
+    camera: Camera, step: int, kept: bool, tmp_path: Path
+) -> None:
+    """``step``: pixels of disparity, of four standard deviations each, from row to row."""
+    shape = camera.height, camera.width
+    inverse = np.full(shape, np.nan)
+    inverse[:20, 10:13] = 0.02 + 4 * step * 1e-5 * np.arange(20)[:, None]
+    depth = (1 / inverse).astype(np.float32)
+    path = tmp_path / "a.npz"
+    save_arrays(
+        path,
+        {
+            "depth": depth,
+            "sigma": np.nan_to_num(1e-5 * depth**2, nan=1).astype(np.float16),
+            "support": np.ones(shape, np.uint8),
+            "score": np.full(shape, 60, np.int8),
+            "paired": np.ones(shape, bool),
+        },
+    )
+    found = cleaned(DepthMap("a", camera, np.eye(4), [], path))["depth"]
+    assert np.isfinite(found).sum() == (60 if kept else 0)

@@ -41,32 +41,55 @@ SHRUNK = 0.7
 SURROUNDINGS = 4
 """Cells across which what stands on the ground is told from the ground."""
 
+RIGHT = 0.01
+"""Share of the camera's height over the surface within which a height is right."""
 
-def anchored(suggested: Map, measured: Map) -> Map:
-    """Heights of a frame's pixels from a suggestion and measurements.
+AROUND = 4.0
+"""Cells, standard deviation of the weights by which measured pixels around a place tell how level the land is there."""
+
+BELIEF = (-0.83, -0.88, 3.16, -2.31)
+"""Logit of the probability that a height is right: constant; times the logarithm of 1 + cells to the nearest measured
+one; times the share of measured pixels around that are right on the plate; where something rises. Fitted by maximum
+likelihood to 130 images of seven rendered flights: of what it gives up to 20, 40, 60, 80 and 100 %, there 14, 32, 51,
+73 and 93 % are right. What the network thinks of its own word told nothing, or the reverse."""
+
+
+def anchored(suggested: Map, measured: Map) -> tuple[Map, Map | None]:
+    """Heights of a frame's pixels from a suggestion and measurements, and how sure they are.
 
     Args:
         suggested: [h, w], metres over the camera (negative below it), finite.
         measured: [h, w], the same, NaN where nothing is measured.
 
     Returns:
-        [h, w]: a thin plate through the medians of the measured cells (Duchon 1977), and on it what the suggestion lets
-        rise over its surroundings; the suggestion itself where too little is measured.
+        heights [h, w]: a thin plate through the medians of the measured cells (Duchon 1977), and on it what the
+        suggestion lets rise over its surroundings; and the probability [h, w] that they are right where nothing is
+        measured. Where too little is measured the suggestion itself, and None.
     """
     import cv2
+    from scipy.ndimage import distance_transform_edt
 
     h, w = suggested.shape
     size = max(1, round(max(h, w) / CELLS))
     medians, weights = _cells(measured, size)
     if not weights.any():
-        return suggested
+        return suggested, None
     rows, columns = medians.shape
     plate = _plate(medians, weights).astype(np.float32)
     surface = cv2.resize(plate, (columns * size, rows * size), interpolation=cv2.INTER_CUBIC)[:h, :w]
     kernel = np.ones((SURROUNDINGS * size | 1,) * 2, np.uint8)
     ground = cv2.GaussianBlur(cv2.morphologyEx(suggested, cv2.MORPH_OPEN, kernel), (0, 0), size)
     rise = suggested - ground
-    return np.asarray(surface + np.where(rise > TALL * np.abs(surface), SHRUNK * rise, 0), np.float32)
+    stands = rise > TALL * np.abs(surface)
+    heights = surface + np.where(stands, SHRUNK * rise, 0)
+    known = np.isfinite(measured).astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        level = (np.abs(measured - surface) < RIGHT * np.abs(surface)).astype(np.float32)
+    total, share = (cv2.GaussianBlur(part, (0, 0), AROUND * size) for part in (known, level))
+    far = distance_transform_edt(weights == 0).astype(np.float32)
+    far = cv2.resize(far, (columns * size, rows * size), interpolation=cv2.INTER_LINEAR)[:h, :w]
+    logit = BELIEF[0] + BELIEF[1] * np.log1p(far) + BELIEF[2] * share / np.maximum(total, 1e-6) + BELIEF[3] * stands
+    return heights.astype(np.float32), (1 / (1 + np.exp(-logit))).astype(np.float32)
 
 
 def _cells(measured: Map, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

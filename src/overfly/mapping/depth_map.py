@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from overfly.files import opened_arrays
 from overfly.geometry import Array, Camera, pixel_grid, rays
-from overfly.mapping.anchor import Map, anchored
+from overfly.mapping.anchor import RIGHT, Map, anchored
+
+ONE_SIGMA = 0.683
+"""Share of errors below one standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,17 @@ class Opinion:
         fall = rays(pixel_grid(width, height), camera.resized(width, height)) @ world_from_camera[2, :3]
         fall = np.minimum(fall, -0.1).astype(np.float32)  # metres down per metre of depth
         small = cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST)
-        heights = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32))
-        return replace(self, depth=np.where(once, heights / fall, self.depth).astype(np.float32))
+        heights, sure = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32))
+        settled = replace(self, depth=np.where(once, heights / fall, self.depth).astype(np.float32))
+        if sure is None:
+            return settled
+        # The standard deviation of a Laplace distribution of which so much is right.
+        sigma = RIGHT * self.alone * np.log(1 - ONE_SIGMA) / np.log(1 - np.clip(sure, 0.01, 0.99))
+        return replace(
+            settled,
+            sigma=np.where(once, sigma, self.sigma).astype(np.float32),
+            confidence=np.where(once, sure, self.confidence).astype(np.float32),
+        )
 
 
 @dataclass(frozen=True)
