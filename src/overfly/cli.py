@@ -132,7 +132,8 @@ def map_(
     network: Annotated[
         str | None,
         typer.Option(
-            help="For --dense sweep and --matcher encoder: a run folder of train.py. Default: the shipped network."
+            help="For --dense sweep and the matchers encoder, both and auto: a run folder of train.py or the name of a "
+            "shipped network. Default: the shipped one."
         ),
     ] = None,
     cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",

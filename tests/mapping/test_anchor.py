@@ -71,7 +71,7 @@ def test_without_measurements_the_suggestion_stands() -> None:
     _, houses = landscape()
     found, sure = anchored(houses, np.full_like(houses, np.nan))
     np.testing.assert_array_equal(found, houses)
-    assert sure is None
+    assert sure.max() < 0.1
 
 
 def test_what_is_far_from_anything_measured_or_beside_rough_land_is_less_sure() -> None:
@@ -84,9 +84,6 @@ def test_what_is_far_from_anything_measured_or_beside_rough_land_is_less_sure() 
     tower = nothing.copy()
     tower[40:50, 70:80] = 20
     stands = anchored(tower, measured)[1]
-    assert level is not None
-    assert rough is not None
-    assert stands is not None
     assert level[:, 55].min() > 0.8 > level[:, 110].max() > 0.3
     assert (rough[:, 55:75] < level[:, 55:75] - 0.2).all()
     assert stands[45, 75] < level[45, 75] - 0.3

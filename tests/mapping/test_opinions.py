@@ -104,7 +104,8 @@ def test_what_pairs_have_measured_tells_the_ground_best(hill, strips, camera, tm
 def test_a_network_sees_whole_pictures_hardly_stretched(shape) -> None:  # type: ignore[no-untyped-def]
     camera = Camera(*shape, 3000.0, 3000.0, shape[0] / 2, shape[1] / 2)
     small = octave_camera(camera, (128, 96))
-    assert {small.width // 2, small.height // 2} <= set(SIDES)  # an octave over what the network takes
+    assert small.width % 64 == small.height % 64 == 0  # an octave over multiples of 32
+    assert max(small.width, small.height) <= 2 * max(SIDES)
     assert 0.85 < small.fx / small.fy < 1.18
     assert small.fov_deg == pytest.approx(camera.fov_deg)
 
@@ -258,3 +259,40 @@ def test_a_sliver_of_wall_is_one_piece_where_its_depth_changes_by_a_few_pixels(
     )
     found = cleaned(DepthMap("a", camera, np.eye(4), [], path))["depth"]
     assert np.isfinite(found).sum() == (60 if kept else 0)
+
+
+@pytest.mark.parametrize("others", [None, True])
+def test_partners_may_have_images_of_another_shape(camera: Camera, others: bool | None, tmp_path: Path) -> None:
+    def level(name: str, lens: Camera, score: float) -> tuple[DepthMap, dict]:
+        shape = lens.height, lens.width
+        data = {"sigma": np.full(shape, 0.1, np.float32), "support": np.ones(shape, np.uint8)}
+        data |= {"depth": np.full(shape, 50, np.float32), "score": np.full(shape, score, np.float32)}
+        if others:
+            data |= {"second": np.zeros(shape, bool), "guessed": np.zeros(shape, bool)}
+        return DepthMap(name, lens, np.eye(4), [], tmp_path / f"{name}.npz"), data
+
+    upright = replace(camera, width=camera.height, height=camera.width, cx=camera.cy, cy=camera.cx)
+    own, data = level("a", camera, 0.9)
+    partner, seen = level("b", upright, 0.9)
+    seen["depth"][:] += 3 * (np.arange(upright.width) % 2)  # so that neighbours are asked, too
+    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
+    Image.fromarray(np.full((camera.height, camera.width, 3), 200, np.uint8)).save(frame.path)
+    cloud, *_ = frame_points(own, data, [(partner, seen, None)], frame, single=True)
+    assert 0 < len(cloud) < camera.width * camera.height  # what the upright image has inside
+
+
+def test_what_is_carried_on_states_its_own_sigma_and_passes_no_camera(camera: Camera) -> None:
+    shape = camera.height, camera.width
+    u = np.arange(camera.width, dtype=np.float32)
+    measured = np.where(u < camera.width / 2, 100 - 1.2 * u * 100 / camera.width, np.nan) * np.ones(shape, np.float32)
+    wild = np.full(shape, 400, np.float32)  # what the network says, alone, is not what is told
+    views = np.ones(shape, np.uint8)
+    opinion = Opinion(wild, wild, np.full(shape, 0.9, np.float32), views, wild)
+    down = np.diag([1.0, -1, -1, 1])
+    settled = opinion.settled(measured.astype(np.float32), camera, down)
+    known = np.isfinite(settled.depth)
+    assert (settled.depth[known] > 0).all()
+    assert known[:, : camera.width // 2].all()
+    near = settled.confidence[:, camera.width // 2 + 2]
+    assert (settled.confidence[:, -1] < near).all()
+    assert (settled.sigma[:, camera.width // 2 + 2] < 3).all()

@@ -54,7 +54,7 @@ likelihood to 130 images of seven rendered flights: of what it gives up to 20, 4
 73 and 93 % are right. What the network thinks of its own word told nothing, or the reverse."""
 
 
-def anchored(suggested: Map, measured: Map) -> tuple[Map, Map | None]:
+def anchored(suggested: Map, measured: Map) -> tuple[Map, Map]:
     """Heights of a frame's pixels from a suggestion and measurements, and how sure they are.
 
     Args:
@@ -64,7 +64,7 @@ def anchored(suggested: Map, measured: Map) -> tuple[Map, Map | None]:
     Returns:
         heights [h, w]: a thin plate through the medians of the measured cells (Duchon 1977), and on it what the
         suggestion lets rise over its surroundings; and the probability [h, w] that they are right where nothing is
-        measured. Where too little is measured the suggestion itself, and None.
+        measured. Where too little is measured the suggestion itself, as sure as what is far from everything.
     """
     import cv2
     from scipy.ndimage import distance_transform_edt
@@ -73,7 +73,8 @@ def anchored(suggested: Map, measured: Map) -> tuple[Map, Map | None]:
     size = max(1, round(max(h, w) / CELLS))
     medians, weights = _cells(measured, size)
     if not weights.any():
-        return suggested, None
+        nothing = BELIEF[0] + BELIEF[1] * np.log1p(CELLS)
+        return suggested, np.full_like(suggested, 1 / (1 + np.exp(-nothing)))
     rows, columns = medians.shape
     plate = _plate(medians, weights).astype(np.float32)
     surface = cv2.resize(plate, (columns * size, rows * size), interpolation=cv2.INTER_CUBIC)[:h, :w]

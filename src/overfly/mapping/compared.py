@@ -132,7 +132,9 @@ def _on_slope(
     found, there = project(places, other.camera, other.world_from_camera)
     scale = there / depth[asked]
     u, v = np.clip(found.astype(int), 0, [other.camera.width - 1, other.camera.height - 1]).T
-    matched = np.isfinite(data["depth"]) & ~data.get("second", np.zeros_like(asked))
+    matched = np.isfinite(data["depth"])
+    if "second" in data:
+        matched &= ~data["second"]
     low, high, widest = np.full(len(rows), np.inf), np.full(len(rows), -np.inf), np.zeros(len(rows))
     height, width = matched.shape
     for i in (-1, 0, 1):

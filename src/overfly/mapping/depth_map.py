@@ -52,13 +52,13 @@ class Opinion:
         fall = np.minimum(fall, -0.1).astype(np.float32)  # metres down per metre of depth
         small = cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST)
         heights, sure = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32))
-        settled = replace(self, depth=np.where(once, heights / fall, self.depth).astype(np.float32))
-        if sure is None:
-            return settled
+        # A slope carried on far enough passes the camera.
+        depth = np.where(heights < 0, heights / fall, np.float32(np.nan))
         # The standard deviation of a Laplace distribution of which so much is right.
-        sigma = RIGHT * self.alone * np.log(1 - ONE_SIGMA) / np.log(1 - np.clip(sure, 0.01, 0.99))
+        sigma = RIGHT * depth * np.log(1 - ONE_SIGMA) / np.log(1 - np.clip(sure, 0.01, 0.99))
         return replace(
-            settled,
+            self,
+            depth=np.where(once, depth, self.depth).astype(np.float32),
             sigma=np.where(once, sigma, self.sigma).astype(np.float32),
             confidence=np.where(once, sure, self.confidence).astype(np.float32),
         )

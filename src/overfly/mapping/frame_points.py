@@ -103,7 +103,7 @@ def frame_points(
     known &= guessed | several | (data["score"] > WORST_SCORE[False] + UNMATCHED * silent - 0.005)
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
-        alone &= data["once"] | (data["sure"] >= SURE_THOUGH_SEEN + SURER * silent)
+        alone &= data["once"] | (data["sure"] > SURE_THOUGH_SEEN + SURER * silent)
     image, shown = _shown(frame, own)
     known = (known | alone) & shown
     fresh = known & ~seen.taken

@@ -24,7 +24,7 @@ from overfly.mapping.settings import SIZE, MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles, write_tiles
 
-BLOCK_FORM, DENSE_FORM = 11, 9
+BLOCK_FORM, DENSE_FORM = 12, 10
 """Of what the steps keep, half-finished parts included: raised whenever the same images and settings become another
 block, or the same block another cloud, so that a map resumed from an older version's folder mixes nothing."""
 
@@ -282,9 +282,10 @@ def _how(asked: MapSettings) -> str:
 
 def _matcher_key(asked: MapSettings) -> list[Any]:
     """What cameras depend on besides the images: "auto" goes by the network's name, since it is seldom loaded."""
-    if asked.matcher == "auto":
-        return ["auto", asked.network_name]
-    return [] if asked.matcher == "sift" else [asked.matcher, _network_key(asked)]
+    if asked.matcher == "sift" or asked.network is None:
+        return []
+    name = asked.network_name if asked.matcher == "auto" else None
+    return [asked.matcher, name or _network_key(asked)]
 
 
 def _network_key(asked: MapSettings) -> Any:

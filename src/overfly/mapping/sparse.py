@@ -76,12 +76,11 @@ def sparse_parts(
     if not good and more is not None:
         database = more()
         richer = built_up(workdir / "more")
-        if richer and (not best or judged(richer)[1] or _better(richer[0], best[0], agrees)):
-            best = richer
-            agrees, good = judged(best)
-        if good:
+        now_agrees, now_good = judged(richer)
+        if richer and (not best or now_agrees > agrees or (now_agrees == agrees and _more_placed(richer[0], best[0]))):
+            best, agrees, good = richer, now_agrees, now_good
             warnings.append(
-                "SIFT found so few matches that sparse mapping failed, and correspondences of the network were added: "
+                "SIFT found too few matches to place all images in agreement with GPS, and the network's were added: "
                 "fly with more overlap, and look at the picture of the block."
             )
     if good or told is None:
@@ -105,6 +104,9 @@ def sparse_parts(
 
 def _better(new: Bundle, old: Bundle, agrees: bool) -> bool:
     """Whether a bundle by priors is worth more than one of sparse mapping, which ``agrees`` with GPS or does not."""
-    if not agrees:
-        return len(new) >= len(old)
+    return _more_placed(new, old) if agrees else len(new) >= len(old)
+
+
+def _more_placed(new: Bundle, old: Bundle) -> bool:
+    """Whether a bundle has more images without much larger errors."""
     return len(new) > len(old) and float(np.median(new.errors())) < WORSE * float(np.median(old.errors()))
