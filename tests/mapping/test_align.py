@@ -228,6 +228,11 @@ def test_points_far_below_or_above_those_around_them_are_left_out() -> None:
     assert good[400:430].mean() > 0.9
     assert not good[430:].any()
     assert beside_others(points[:5], centres).all()
+    together = np.array([2000.0, 0, -1500]) + np.random.default_rng(1).uniform(-20, 20, (12, 3))
+    crowd = np.concatenate([np.repeat(points, 8, axis=0), together])  # a hundredth at the most
+    good = beside_others(crowd, centres)
+    assert good[:-12].all()
+    assert not good[-12:].any()
 
 
 def test_an_interrupted_matching_goes_on_with_the_same_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,10 @@ AROUND, OFF_OTHERS = 8, 0.35
 """Nearest points in plan that a sparse point is compared with, none farther than the cameras are high; share of that
 height that it may be off them."""
 
+OUTER, BEYOND = 0.01, 0.5
+"""Share of all points at either end in height that may be wrong together, where their neighbours are as wrong as they;
+how far beyond the others, as a share of the cameras' height, they are left out."""
+
 BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
@@ -72,4 +76,6 @@ def beside_others(points: Array, centres: Array) -> NDArray[np.bool_]:
     height = abs(float(np.median(centres[:, 2]) - np.median(points[:, 2])))
     away, near = (np.asarray(found) for found in cKDTree(points[:, :2]).query(points[:, :2], k=AROUND + 1))
     off = np.abs(points[:, 2] - np.median(points[:, 2][near[:, 1:]], axis=1))
-    return np.asarray((off < OFF_OTHERS * height) & (away[:, -1] < height))
+    low, high = np.quantile(points[:, 2], [OUTER, 1 - OUTER]) + BEYOND * height * np.array([-1, 1])
+    usual = (points[:, 2] > low) & (points[:, 2] < high)
+    return np.asarray(usual & (off < OFF_OTHERS * height) & (away[:, -1] < height))
