@@ -137,3 +137,4 @@ def test_more_matches_are_asked_for_where_they_are_too_few(
     assert read == ([] if priors_of is None else [priors_of])
     assert bool(asked) == (taken != "few")
     assert len(warnings) == told
+    assert all("network" in warning for warning in warnings)  # whoever reads the report is told that it was asked

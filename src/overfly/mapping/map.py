@@ -110,7 +110,7 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
     check_place(flight, asked.heights, estimate=estimate, control=asked.control)
     steps.say("images", _about(flight))
     ruled = [asked.control] if flight.gcps and asked.control != "split" else []
-    matched = [asked.seed, *ruled, *_matcher_key(asked)]
+    matched = [asked.seed, *ruled, *asked.matcher_key()]
     key = key_of(__version__, BLOCK_FORM, identity, estimate, matched if estimate else None)
     block = steps.kept(
         "cameras",
@@ -126,7 +126,7 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
 
 def _measured(flight: Flight, block: Block, key: str, asked: MapSettings, steps: Steps) -> Tiles:
     """The dense cloud of a block, whose own key is given."""
-    network = _network_key(asked) if asked.dense == "sweep" else None
+    network = asked.network_key() if asked.dense == "sweep" else None
     key = key_of(key, DENSE_FORM, asked.dense, network, asked.seed, *([] if asked.size == SIZE else [asked.size]))
     make: Callable[[Path], Tiles] = {
         "sweep": lambda scratch: sweep_cloud(block, flight, scratch, asked, steps),
@@ -278,26 +278,6 @@ def _about_block(block: Block, flight: Flight) -> str:
 
 def _how(asked: MapSettings) -> str:
     return "semi-global stereo" if asked.dense == "stereo" else f"the network {asked.network_name or ''}".strip()
-
-
-def _matcher_key(asked: MapSettings) -> list[Any]:
-    """What cameras depend on besides the images: "auto" goes by the network's name, since it is seldom loaded."""
-    if asked.matcher == "sift" or asked.network is None:
-        return []
-    name = asked.network_name if asked.matcher == "auto" else None
-    return [asked.matcher, name or _network_key(asked)]
-
-
-def _network_key(asked: MapSettings) -> Any:
-    """What a trained run's answer depends on: its weights."""
-    import hashlib
-
-    digest = hashlib.sha256()
-    assert asked.run is not None
-    for name, value in asked.run.network.state_dict().items():
-        digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def _camera_files(root: Path) -> list[tuple[str, int, int]]:

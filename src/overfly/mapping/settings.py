@@ -119,6 +119,24 @@ class MapSettings:
         """The trained run, loaded when it is first asked for."""
         return self.network() if callable(self.network) else self.network
 
+    def matcher_key(self) -> list[str]:
+        """What cameras depend on besides the images: "auto" goes by the network's name, since it is seldom loaded."""
+        if self.matcher == "sift" or self.network is None:
+            return []
+        name = self.network_name if self.matcher == "auto" else None
+        return [self.matcher, name or self.network_key()]
+
+    def network_key(self) -> str:
+        """What a trained run's answer depends on: its weights."""
+        import hashlib
+
+        digest = hashlib.sha256()
+        assert self.run is not None
+        for name, value in self.run.network.state_dict().items():
+            digest.update(name.encode())
+            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
     def shown(self) -> dict[str, Any]:
         """For the report and map.json."""
         return {
