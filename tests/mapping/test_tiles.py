@@ -191,8 +191,8 @@ def some_cloud(n: int = 3000) -> Cloud:
 
 def test_a_frames_points_are_read_square_by_square(tmp_path: Path) -> None:
     cloud = some_cloud()
-    guessed = cloud.points[:, 2] > 15
-    part = write_part(tmp_path / "a.npz", cloud, guessed, gsd=0.4)
+    apart = np.where(cloud.points[:, 2] > 15, 30, 0).astype(np.uint8)
+    part = write_part(tmp_path / "a.npz", cloud, apart, gsd=0.4)
     assert part.side == 128  # the power of two from 256 ground pixels on
     again = read_part(tmp_path / "a.npz")
     np.testing.assert_array_equal(again.squares, part.squares)
@@ -202,8 +202,8 @@ def test_a_frames_points_are_read_square_by_square(tmp_path: Path) -> None:
     inside = ((cloud.points[:, :2] >= low) & (cloud.points[:, :2] <= high)).all(1)
     assert {tuple(p) for p in cloud.points[inside]} <= {tuple(p) for p in records["points"]}
     assert len(records) < len(cloud) / 10
-    np.testing.assert_array_equal(records["guessed"], records["points"][:, 2] > 15)
-    assert not len(write_part(tmp_path / "b.npz", cloud[:0], guessed[:0], float("nan")).squares)
+    np.testing.assert_array_equal(records["apart"] == 30, records["points"][:, 2] > 15)
+    assert not len(write_part(tmp_path / "b.npz", cloud[:0], apart[:0], float("nan")).squares)
     assert not len(read_part(tmp_path / "b.npz").touched(low, high))
 
 
@@ -264,6 +264,7 @@ def test_maps_without_any_depth_are_refused(flight, tmp_path: Path) -> None:  # 
 
 
 def test_tiles_end_where_the_filters_cells_do() -> None:
-    from overfly.mapping.thinning import CROWD, NEAR
+    from overfly.mapping.frame_points import AWAY, NEAR
+    from overfly.mapping.thinning import CROWD
 
-    assert BLOCK % CROWD == BLOCK % NEAR == 0
+    assert BLOCK % CROWD == BLOCK % NEAR == BLOCK % AWAY == 0

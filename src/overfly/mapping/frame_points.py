@@ -24,6 +24,17 @@ SURE_THOUGH_SEEN, SURER = 0.7, 0.1
 """Confidence from which on a network's word alone stands where another frame has the place inside and nothing is
 matched, and what is added for each further one: against four it never stands."""
 
+AGREED, AGREED_UNSEEN = 0.8, 0.6
+"""Confidence from which on a network's word stands that another frame agrees with: the first where further frames have
+the place inside and say something else, which is what waves and shadows do, the second where none has."""
+
+NEAR, AWAY = 4, 30
+"""Voxels along a cell of the plan in which one matched point makes a guess needless: the first if other frames agree
+with it or it is sure, the second else."""
+
+SURE_NEAR = 0.6
+"""Confidence from which on what one frame alone sees may stand close to matched points."""
+
 SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.7
 """Connected pieces of depth with fewer pixels are speckle; pieces up to the second size must correlate so well."""
 
@@ -76,7 +87,7 @@ def frame_points(
     partners: Iterable[Partner],
     frame: Frame,
     single: bool,
-) -> tuple[Cloud, NDArray[np.bool_], NDArray[np.bool_], float]:
+) -> tuple[Cloud, NDArray[np.uint8], NDArray[np.bool_], float]:
     """The points of one map that earlier maps have not given.
 
     Args:
@@ -87,7 +98,8 @@ def frame_points(
         single: keep points that only one pair has seen.
 
     Returns:
-        The points, which of them no pair has matched [N], which pixels are given now [H, W], and metres per pixel.
+        The points; voxels [N] along the cell of the plan in which no matched point may be for them to stand, 0 for what
+        pairs have matched; which pixels are given now [H, W]; and metres per pixel.
     """
     depth: Map = data["depth"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
@@ -104,29 +116,29 @@ def frame_points(
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
         alone &= data["once"] | (data["sure"] > SURE_THOUGH_SEEN + SURER * silent)
+    own_word = data["sure"] if "sure" in data else np.float32(0)
+    confidence = np.where(guessed, own_word, _confidence(votes, agree, data["score"])).astype(np.float32)
+    doubted = second & ~alone & (confidence < np.where(silent > 0, AGREED, AGREED_UNSEEN))
+    near = ~alone | (data.get("once", False) & (confidence >= SURE_NEAR))
+    apart = np.where(second, np.where(near, NEAR, AWAY), 0).astype(np.uint8)
     image, shown = _shown(frame, own)
     known = (known | alone) & shown
-    fresh = known & ~seen.taken
+    fresh = known & ~seen.taken & ~doubted  # which counts as given: another frame's word on it is no better
     merged = seen.depth[fresh]
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = unproject(pixels, merged, own.camera, own.world_from_camera)
-    votes = votes[fresh]
     cloud = Cloud(
         points,
         image[rows, columns],
-        confidence=np.where(
-            guessed[fresh],
-            data["sure"][fresh] if "sure" in data else 0,
-            _confidence(votes, agree[fresh], data["score"][fresh]),
-        ).astype(np.float32),
+        confidence=confidence[fresh],
         sigma_m=seen.sigma[fresh].astype(np.float32),
-        views=(1 + votes).astype(np.uint8),
+        views=(1 + votes[fresh]).astype(np.uint8),
         predicted=alone[fresh],
     )
     measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
     gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
-    return cloud, second[fresh], known, gsd
+    return cloud, apart[fresh], known, gsd
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -92,7 +92,8 @@ def fuse(
         tile = written_tile(folder, name)
         if tile is None:
             matched, guesses = fusion.points(layout, low, high)
-            tile = write_tile(folder, name, thinned_tile(cloud_of(matched), cloud_of(guesses), layout.voxel, low, high))
+            made = thinned_tile(cloud_of(matched), cloud_of(guesses), guesses["apart"], layout.voxel, low, high)
+            tile = write_tile(folder, name, made)
         tiles.append(tile)
         for k in layout.last_needed(t):
             fusion.path(k).unlink(missing_ok=True)
@@ -128,11 +129,11 @@ class _Fusion:
     def make(self, k: int) -> Part:
         """Work out the points of a frame and keep them, and which pixels it gives, for the frames after it."""
         own = self.maps[k]
-        cloud, guessed, given, gsd = frame_points(
+        cloud, apart, given, gsd = frame_points(
             own, self.load(k), self._partners(k), self.frames[own.name], self.single
         )
         save_arrays(self._mask(k), {"bits": np.packbits(given), "shape": np.array(given.shape)})
-        return write_part(self.path(k), cloud, guessed, gsd)
+        return write_part(self.path(k), cloud, apart, gsd)
 
     def points(self, layout: Layout, low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:
         """What all frames give of a tile (:data:`overfly.mapping.parts.RECORD`): matched points, also in the margin
@@ -148,7 +149,7 @@ class _Fusion:
                 self.make(k)
                 records = read_squares(self.path(k), numbers)
             at = voxels(records["points"][:, :2], layout.voxel)
-            guessed = records["guessed"]
+            guessed = records["apart"] > 0
             matched.append(records[~guessed & within(at, low - MARGIN, high + MARGIN)])
             guesses.append(records[guessed & within(at, low, high)])
         return np.concatenate(matched), np.concatenate(guesses)

@@ -22,7 +22,7 @@ PIXELS = 256
 RECORD = np.dtype(
     [
         ("points", "<f8", 3), ("colors", "u1", 3), ("confidence", "<f4"), ("sigma_m", "<f4"), ("views", "u1"),
-        ("predicted", "?"), ("guessed", "?"),
+        ("predicted", "?"), ("apart", "u1"),
     ]
 )  # fmt: skip
 
@@ -51,8 +51,8 @@ class Part:
         return np.flatnonzero(((west <= high) & (west + self.side >= low)).all(1))
 
 
-def write_part(path: Path, cloud: Cloud, guessed: NDArray[np.bool_], gsd: float) -> Part:
-    """Write a frame's points, atomically; which of them no pair has matched goes with them as ``guessed`` [N]."""
+def write_part(path: Path, cloud: Cloud, apart: NDArray[np.uint8], gsd: float) -> Part:
+    """Write a frame's points, atomically, and with them how far ``apart`` from matched points they must be [N]."""
     if not len(cloud):
         part = Part(float("nan"), 1.0, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
         save_arrays(path, {"facts": np.array([part.gsd, part.side]), "squares": part.squares, "counts": part.counts})
@@ -66,7 +66,7 @@ def write_part(path: Path, cloud: Cloud, guessed: NDArray[np.bool_], gsd: float)
     squares = np.stack([known // rows, known % rows], axis=1) + low
     records = np.empty(len(cloud), RECORD)
     for name in RECORD.names or ():
-        records[name] = (guessed if name == "guessed" else getattr(cloud, name))[order]
+        records[name] = (apart if name == "apart" else getattr(cloud, name))[order]
     pieces = {str(i): piece for i, piece in enumerate(np.split(records, starts[1:]))}
     save_arrays(path, {"facts": np.array([gsd, side]), "squares": squares, "counts": counts, **pieces})
     return Part(gsd, side, squares, counts)
@@ -97,5 +97,5 @@ def read_squares(path: Path, numbers: NDArray[np.int64]) -> NDArray:
 def cloud_of(records: NDArray) -> Cloud:
     """Records as a cloud."""
     arrays: dict[str, Any] = {name: np.ascontiguousarray(records[name]) for name in RECORD.names or ()}
-    arrays.pop("guessed")
+    arrays.pop("apart")
     return Cloud(**arrays)

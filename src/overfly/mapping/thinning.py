@@ -16,9 +16,6 @@ from overfly.cloud import Cloud, concatenate, voxel_thin
 CROWD = 8
 """Voxels along a cell in which company is counted."""
 
-NEAR = 30
-"""Voxels along a cell of the plan, in which one matched point makes guesses needless: about ground pixels."""
-
 FEWEST = 6
 """Points in a cell and its 26 neighbours, or they are stray."""
 
@@ -33,21 +30,30 @@ MARGIN = CROWD
 """Voxels around a tile whose matched points its filters must know."""
 
 
-def thinned_tile(matched: Cloud, guesses: Cloud, size: float, low: NDArray, high: NDArray) -> Cloud:
+def thinned_tile(
+    matched: Cloud, guesses: Cloud, apart: NDArray[np.uint8], size: float, low: NDArray, high: NDArray
+) -> Cloud:
     """The finished points of a tile.
 
     Args:
         matched: all points that pairs have matched in the tile and :data:`MARGIN` voxels around it, in a fixed order.
         guesses: all other points, of the tile alone.
+        apart: voxels [N] along the cell of the plan, divisors of :data:`BLOCK`, in which a matched point makes a guess
+            needless.
         size: side of a voxel.
         low, high: [2], the tile's first voxel and the one behind its last, multiples of :data:`BLOCK`.
     """
-    first, second = (thinned(cloud, size) for cloud in (matched, guesses))
+    first = matched[thinned(matched, size)]
     first = first[accompanied(first.points, size)]
     first = first[within(voxels(first.points, size), low, high)]
-    assert second.confidence is not None
-    second = second[second.confidence >= LEAST_CONFIDENT]
-    return concatenate([first, second[_elsewhere(second, first, size)]])
+    assert guesses.confidence is not None
+    chosen = thinned(guesses, size)
+    chosen = chosen[guesses.confidence[chosen] >= LEAST_CONFIDENT]
+    stand = np.zeros(len(chosen), bool)
+    for cells in np.unique(apart[chosen]):
+        these = apart[chosen] == cells
+        stand[these] = _elsewhere(guesses.points[chosen[these]], first.points, size, int(cells))
+    return concatenate([first, guesses[chosen[stand]]])
 
 
 def within(at: NDArray[np.int64], low: NDArray, high: NDArray) -> NDArray[np.bool_]:
@@ -60,11 +66,11 @@ def voxels(points: NDArray, size: float) -> NDArray[np.int64]:
     return np.floor(points / size).astype(np.int64)
 
 
-def thinned(cloud: Cloud, size: float) -> Cloud:
-    """The most confident point of each voxel; the first of equals."""
+def thinned(cloud: Cloud, size: float) -> NDArray[np.int64]:
+    """Numbers of the most confident point of each voxel; the first of equals."""
     assert cloud.confidence is not None
-    cloud = cloud[np.argsort(-cloud.confidence, kind="stable")]
-    return cloud[voxel_thin(cloud.points, size)] if len(cloud) else cloud
+    order = np.argsort(-cloud.confidence, kind="stable")
+    return order[voxel_thin(cloud.points[order], size)] if len(cloud) else order
 
 
 def accompanied(points: NDArray, size: float) -> NDArray[np.bool_]:
@@ -93,11 +99,11 @@ def _closed_up(values: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(np.concatenate([[1], 1 + np.cumsum(np.minimum(np.diff(known), 2))])[owner])
 
 
-def _elsewhere(guesses: Cloud, matched: Cloud, size: float) -> NDArray[np.bool_]:
-    """Guessed points in whose cell of the plan nothing was matched: what is measured needs no guess beside it."""
+def _elsewhere(guesses: NDArray, matched: NDArray, size: float, apart: int) -> NDArray[np.bool_]:
+    """Guessed points [N, 3] in whose cell of the plan nothing was matched: what is measured needs no guess."""
     if not len(guesses) or not len(matched):
         return np.ones(len(guesses), bool)
-    cells = [voxels(cloud.points[:, :2], size) // NEAR for cloud in (guesses, matched)]
+    cells = [voxels(points[:, :2], size) // apart for points in (guesses, matched)]
     low = np.minimum(*(c.min(0) for c in cells))
     columns = int(max(c[:, 1].max() for c in cells) - low[1]) + 1
     return ~np.isin(*((c[:, 0] - low[0]) * columns + c[:, 1] - low[1] for c in cells))
