@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-SAME = ("cloud.laz", "dsm.tif", "orthophoto.tif", "transforms.json")
+SAME = ("cloud.laz", "dsm.tif", "dsm_source.tif", "orthophoto.tif", "transforms.json")
 
 
 def fingerprints(folder: Path) -> dict[str, str]:

@@ -102,7 +102,8 @@ def test_a_flight_with_an_origin_becomes_a_georeferenced_map(
     out = tmp_path / "out"
     names = {p.name for p in out.iterdir()}
     assert names == {
-        "cloud.laz", "cloud.ply", "dsm.tif", "orthophoto.tif", "transforms.json", "map.json", "report.html", "work",
+        "cloud.laz", "cloud.ply", "dsm.tif", "dsm_source.tif", "orthophoto.tif", "transforms.json", "map.json",
+        "report.html", "work",
     }  # fmt: skip
     assert json.loads((out / "map.json").read_text()) == summary
     assert {
@@ -113,6 +114,8 @@ def test_a_flight_with_an_origin_becomes_a_georeferenced_map(
     assert summary["cameras_from"] == "transforms.json"
     assert summary["gsd_m"] == pytest.approx(55 / 80, rel=0.02)
     assert summary["points"] == summary["measured"] + summary["predicted"]
+    assert sum(summary["surface"].values()) == pytest.approx(1, abs=2e-4)
+    assert "of the surface model measured" in (out / "report.html").read_text()
     assert {"cameras", "dense", "products", "report"} <= summary["seconds"].keys()
     cloud = read_cloud(out / "cloud.laz")
     assert cloud.epsg == 32615

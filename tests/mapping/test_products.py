@@ -9,7 +9,8 @@ import pytest
 
 from overfly.cloud import Cloud
 from overfly.errors import InputError
-from overfly.mapping.products import NODATA, cell_size, raster_products
+from overfly.mapping.gaps import COARSE, HOLE, INTERPOLATED, MEASURED, NODATA, PALETTE, PREDICTED, REACH
+from overfly.mapping.products import cell_size, raster_products
 from overfly.mapping.raster import Grid, grid_over, surface
 from overfly.mapping.tiles import Tiles, write_tiles
 
@@ -21,11 +22,12 @@ def tiled(cloud: Cloud, folder: Path, side: float = 1e9) -> Tiles:
 
 
 def rough_ground(n: int = 30_000) -> Cloud:
-    """40 x 25 m of thin, noisy, coloured points with houses, a hole and single strays: all that filters work on."""
+    """40 x 25 m of thin, noisy, coloured points with houses, a hole, a missing corner and single strays."""
     rng = np.random.default_rng(4)
     points = rng.uniform([100, -50, 0], [140, -25, 0.3], (n, 3))
     points[(np.floor(points[:, :2] / 7).sum(1) % 3) == 0, 2] += 6
     points = points[np.hypot(*(points[:, :2] - [117, -38]).T) > 3]
+    points = points[(points[:, 0] < 120) | (points[:, 1] < -37)]
     points[::500, 2] += rng.uniform(-20, 20, len(points[::500]))
     return Cloud(points, rng.integers(0, 255, (len(points), 3), dtype=np.uint8))
 
@@ -34,7 +36,7 @@ def bands(folder: Path) -> dict[str, np.ndarray]:
     import rasterio
 
     found = {}
-    for name in ("dsm", "orthophoto"):
+    for name in ("dsm", "dsm_source", "orthophoto"):
         with rasterio.open(folder / f"{name}.tif") as file:
             found[name] = file.read()
     return found
@@ -48,6 +50,8 @@ def test_no_seam_of_tiles_or_windows_shows(tmp_path: Path, side: float, window: 
     raster_products(tiled(cloud, many / "tiles", side), many, gsd=0.1, window=window)
     whole, cut = bands(one), bands(many)
     assert (whole["dsm"] == NODATA).any()
+    assert np.unique(whole["dsm_source"]).tolist() == [0, MEASURED, INTERPOLATED]
+    np.testing.assert_array_equal(cut["dsm_source"], whole["dsm_source"])
     np.testing.assert_allclose(cut["dsm"], whole["dsm"], atol=1e-5)
     np.testing.assert_array_equal(cut["orthophoto"], whole["orthophoto"])
 
@@ -79,7 +83,7 @@ def test_a_painter_colours_the_windows_from_the_surface_around_them(tmp_path: Pa
         return made[-1]
 
     cloud = rough_ground()
-    grid = raster_products(tiled(cloud, tmp_path / "tiles"), tmp_path, gsd=gsd, painter=make, window=25)
+    grid, _ = raster_products(tiled(cloud, tmp_path / "tiles"), tmp_path, gsd=gsd, painter=make, window=25)
     found = bands(tmp_path)
     assert made[0].windows > 4
     extent = made[0].overview.extent
@@ -148,7 +152,7 @@ def test_files_read_back(tmp_path: Path, epsg: int | None) -> None:
     colors = np.full((len(points), 3), (200, 100, 50), np.uint8)
     cloud = Cloud(points, colors, epsg=epsg)
     raster_products(tiled(cloud, tmp_path / "tiles"), tmp_path, gsd=0.1034)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["dsm.tif", "orthophoto.tif", "tiles"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dsm.tif", "dsm_source.tif", "orthophoto.tif", "tiles"]
     with rasterio.open(tmp_path / "dsm.tif") as dsm:
         assert (dsm.crs.to_epsg() if dsm.crs else None) == epsg
         assert dsm.nodata == NODATA
@@ -158,11 +162,54 @@ def test_files_read_back(tmp_path: Path, epsg: int | None) -> None:
         assert -0.03 < dsm.res[0] - cell_size([cloud], 0.1) < 0.1
         assert abs(np.remainder(dsm.transform.c / dsm.res[0] + 0.5, 1) - 0.5) < 1e-6
         values = [v[0] for v in dsm.sample([(600_035, 5_000_010), (600_020, 5_000_010), (600_010, 5_000_010)])]
-        assert values == pytest.approx([12.0, 0.0, NODATA], abs=0.02)
+        assert values == pytest.approx([12.0, 0.0, 0.0], abs=0.02)
+    with rasterio.open(tmp_path / "dsm_source.tif") as source:
+        assert source.nodata == 0
+        assert source.colormap(1)[INTERPOLATED] == PALETTE[INTERPOLATED]
+        places = [(600_035, 5_000_010), (600_020, 5_000_010), (600_010, 5_000_010)]
+        assert [v[0] for v in source.sample(places)] == [MEASURED, MEASURED, INTERPOLATED]
     with rasterio.open(tmp_path / "orthophoto.tif") as photo:
         assert [v.tolist() for v in photo.sample([(600_035, 5_000_010), (600_010, 5_000_010)])] == [
             [200, 100, 50, 255], [0, 0, 0, 0],
         ]  # fmt: skip
+
+
+def plain(size: int = 640) -> Cloud:
+    """A slope of 1 in 10 with four points in every cell of a metre, two of three predicted in its eastern quarter."""
+    x, y = np.meshgrid(np.arange(2 * size) / 2 + 0.25, np.arange(2 * size) / 2 + 0.25)
+    points = np.column_stack([x.ravel(), y.ravel(), x.ravel() / 10])
+    guessed = (points[:, 0] > 0.75 * size) & (np.arange(len(points)) % 3 > 0)
+    return Cloud(points, np.zeros((len(points), 3), np.uint8), predicted=guessed)
+
+
+@pytest.mark.parametrize(
+    ("radius", "at", "filled"),
+    [
+        (0.9 * HOLE * COARSE, (300, 320), True),  # enclosed
+        (1.2 * HOLE * COARSE, (300, 320), False),  # so large that it may be a lake
+        (0.8 * REACH * COARSE, (0, 320), True),  # a bay
+        (2.5 * REACH * COARSE, (0, 320), False),
+    ],
+)
+def test_gaps_between_known_cells_are_interpolated_and_marked(
+    tmp_path: Path, radius: float, at: tuple[float, float], filled: bool
+) -> None:
+    import rasterio
+
+    cloud = plain()
+    gone = np.hypot(*(cloud.points[:, :2] - at).T) < radius
+    grid, shares = raster_products(tiled(cloud[~gone], tmp_path / "tiles"), tmp_path, gsd=0.5, window=100)
+    assert grid.cell == 1
+    inside = (at[0] + 25.5, at[1] + 0.5)
+    with rasterio.open(tmp_path / "dsm.tif") as dsm, rasterio.open(tmp_path / "dsm_source.tif") as source:
+        height, origin = (next(file.sample([inside]))[0] for file in (dsm, source))
+        assert [next(source.sample([(x, 600)]))[0] for x in (20, 600)] == [MEASURED, PREDICTED]
+        counts = np.bincount(source.read(1).ravel(), minlength=4)
+    assert origin == (INTERPOLATED if filled else 0)
+    assert height == pytest.approx(inside[0] / 10 if filled else NODATA, abs=0.1 * radius)
+    assert shares["interpolated"] == pytest.approx(counts[INTERPOLATED] / counts[1:].sum(), abs=1e-4)
+    assert sum(shares.values()) == pytest.approx(1, abs=2e-4)
+    assert 0.1 < shares["predicted"] < 0.3
 
 
 def test_sparse_clouds_get_larger_cells() -> None:

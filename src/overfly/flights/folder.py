@@ -14,7 +14,7 @@ from overfly.flights.odm import read_gcps, read_geo
 from overfly.flights.remarks import altitude_remarks, listed, metadata_remarks
 from overfly.flights.transforms import Cameras, read_transforms
 
-PRODUCTS = {"dsm.tif", "dtm.tif", "orthophoto.tif"}
+PRODUCTS = {"dsm.tif", "dsm_source.tif", "dtm.tif", "orthophoto.tif"}
 """Results that may lie beside the images of a plain folder and are no photographs."""
 
 

@@ -74,17 +74,18 @@ def deliver(
     level = bool(turn[2, 2] > LEVEL)
     turn = np.eye(4) if level else turn
     written = ["cloud.laz", *(["cloud.ply"] if asked.ply else [])]
+    sources = None
     with steps.timed("products"):
         # What an earlier map left may have other heights, and is not written each time.
-        for name in ("cloud.ply", "dsm.tif", "orthophoto.tif", "mesh.glb"):
+        for name in ("cloud.ply", "dsm.tif", "dsm_source.tif", "orthophoto.tif", "mesh.glb"):
             (out / name).unlink(missing_ok=True)
         for name in written:
             write_clouds(placed, out / name, count=len(placed), low=placed.bounds.min((0, 1)))
         facts = {} if block.metric else {"scale": "unknown"}
         write_transforms(out / "transforms.json", block.frames, block.origin, facts)
         if level:
-            views, gains = _rasters(placed, block, few_placed.epsg, out, gsd=gsd, window=window, sample=sample)
-            written += ["dsm.tif", "orthophoto.tif"]
+            views, gains, sources = _rasters(placed, block, few_placed.epsg, out, gsd=gsd, window=window, sample=sample)
+            written += ["dsm.tif", "dsm_source.tif", "orthophoto.tif"]
         written += ["transforms.json", "map.json"]
     steps.say("products", ", ".join(written[:-1]))
     mesh, unmade = None, list[Caution]()
@@ -106,7 +107,7 @@ def deliver(
             photo=photo_overview(out / "orthophoto.tif") if level else None,
         )
     summary = summarise(flight, block, cloud_facts(placed, few_placed, seen, gsd), few_placed.crs, asked, steps)
-    summary["mesh"] = mesh
+    summary |= {"surface": sources, "mesh": mesh}
     found = [*_cautions(flight, block, seen, summary, level), *unmade]
     summary["warnings"] = [str(c).strip() for c in found]
     with steps.timed("report"):
@@ -129,16 +130,16 @@ def deliver(
 
 def _rasters(
     placed: Tiles, block: Block, epsg: int | None, out: Path, *, gsd: float, window: int, sample: int
-) -> tuple[list[View], Gains]:
-    """Write surface model and orthophoto; the frames that stand above the surface, and their gains."""
+) -> tuple[list[View], Gains, dict[str, float]]:
+    """Write the rasters; the frames that stand above the surface, their gains, and where the surface comes from."""
     made: list[Orthophoto] = []
 
     def photographs(overview: Grid, heights: NDArray) -> Orthophoto:
         made.append(Orthophoto(block.frames, overview, heights, origin=block.origin if epsg else None))
         return made[0]
 
-    raster_products(placed, out, gsd=gsd, painter=photographs, window=window, sample=sample)
-    return made[0].frames, made[0].gains
+    _, sources = raster_products(placed, out, gsd=gsd, painter=photographs, window=window, sample=sample)
+    return made[0].frames, made[0].gains, sources
 
 
 def _mesh(

@@ -1,4 +1,4 @@
-"""The rasters made from a cloud: surface model (dsm.tif) and orthophoto (orthophoto.tif), window by window.
+"""The rasters made from a cloud: surface model (dsm.tif), its sources and orthophoto (orthophoto.tif), by windows.
 
 A window is computed with as many cells around it as its filters look at, so that no border of a window shows. Windows
 go to a plain GeoTIFF beside the target, which becomes a cloud-optimised one at the end.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,10 +18,11 @@ from overfly.cloud import Cloud, concatenate
 from overfly.errors import InputError
 from overfly.files import replacing
 from overfly.geodesy import crs_code
+from overfly.mapping.gaps import INTERPOLATED, MEASURED, NODATA, PALETTE, PREDICTED, close_gaps
 from overfly.mapping.raster import Grid, grid_over, surface
 from overfly.mapping.tiles import Tiles
+from overfly.mapping.windows import window_over, windows
 
-NODATA = -9999.0
 MAX_CELLS = 200_000_000
 """Cells above which a map must be filled by its points: stray points make a large map of nothing."""
 
@@ -68,22 +68,22 @@ def raster_products(
     painter: PainterMaker | None = None,
     window: int = WINDOW,
     sample: int = SAMPLE,
-) -> Grid:
-    """Write ``dsm.tif`` and ``orthophoto.tif`` beside each other, as cloud-optimised GeoTIFFs.
+) -> tuple[Grid, dict[str, float]]:
+    """Write ``dsm.tif``, ``dsm_source.tif`` and ``orthophoto.tif`` beside each other, as cloud-optimised GeoTIFFs.
 
     Args:
         cloud: coloured points; their CRS becomes the files', the vertical one only the surface model's.
         out: folder.
         gsd: ground sampling distance in the cloud's unit, of which two digits are used: the orthophoto's cells are
             as large, the surface model's a whole multiple (see :func:`cell_size`).
-        fill: passes that close gaps of single cells.
+        fill: passes that close gaps of single cells; larger ones are closed as :mod:`overfly.mapping.gaps` says.
         painter: colours the orthophoto, in cells of one GSD; None takes the mean colours of the points, in the
             surface model's cells.
         window: cells computed at once, each way; what is written does not depend on it.
         sample: points by which the extent is told; twice as many tell the size of the cells.
 
     Returns:
-        The grid of the surface model.
+        The grid of the surface model, and the share of its cells that is measured, predicted and interpolated.
 
     Raises:
         InputError: the cloud is empty, or its extent does not fit a raster (stray points or a wrong scale).
@@ -100,15 +100,20 @@ def raster_products(
             "does not fit its resolution; check the cameras for strays."
         )
     photo, level = out / "orthophoto.tif", None if few.epsg is None else crs_code(few.epsg)
-    with _raster(out / "dsm.tif", grid, few.crs, 1, "float32", nodata=NODATA) as heights:
+    with (
+        _raster(out / "dsm.tif", grid, few.crs, 1, "float32", nodata=NODATA) as heights,
+        _raster(out / "dsm_source.tif", grid, level, 1, "uint8", nodata=0) as sources,
+    ):
+        sources.write_colormap(1, PALETTE)
         if painter is None and few.colors is not None:
             with _raster(photo, grid, level, 4, "uint8") as colors:
-                _draw(cloud, grid, fill, window, heights, colors)
+                _draw(cloud, grid, fill, window, heights, sources, colors)
         else:
-            _draw(cloud, grid, fill, window, heights, None)
+            _draw(cloud, grid, fill, window, heights, sources, None)
+        shares = close_gaps(heights, sources, grid, window)
         if painter is not None:
             _paint(heights, grid, painter, grid.cell / parts, photo, level, window)
-    return grid
+    return grid, shares
 
 
 def cell_size(clouds: Sequence[Cloud], gsd: float) -> float:
@@ -138,58 +143,8 @@ def _hit(clouds: Sequence[Cloud], cell: float) -> int | None:
     return grid.hit(*(cloud.points for cloud in clouds))
 
 
-@dataclass(frozen=True)
-class Window:
-    """Rows and columns of a grid."""
-
-    whole: Grid
-    rows: slice
-    columns: slice
-
-    @property
-    def grid(self) -> Grid:
-        """Of these cells alone."""
-        cell = self.whole.cell
-        return Grid(
-            self.whole.x_min + self.columns.start * cell,
-            self.whole.y_max - self.rows.start * cell,
-            cell,
-            self.rows.stop - self.rows.start,
-            self.columns.stop - self.columns.start,
-        )
-
-    @property
-    def place(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """As rasterio writes it: (first and last row + 1, first and last column + 1)."""
-        return (self.rows.start, self.rows.stop), (self.columns.start, self.columns.stop)
-
-    def wide(self, cells: int) -> Window:
-        """With so many cells more on each side, as far as the grid goes."""
-        return Window(
-            self.whole,
-            slice(max(0, self.rows.start - cells), min(self.whole.rows, self.rows.stop + cells)),
-            slice(max(0, self.columns.start - cells), min(self.whole.columns, self.columns.stop + cells)),
-        )
-
-    def inside(self, wide: Window) -> tuple[slice, slice]:
-        """Where it lies in a wider one."""
-        row, column = wide.rows.start, wide.columns.start
-        return (
-            slice(self.rows.start - row, self.rows.stop - row),
-            slice(self.columns.start - column, self.columns.stop - column),
-        )
-
-
-def windows(grid: Grid, cells: int) -> Iterator[Window]:
-    """The windows of a grid, row by row from the north-west."""
-    for row in range(0, grid.rows, cells):
-        for column in range(0, grid.columns, cells):
-            rows = slice(row, min(row + cells, grid.rows))
-            yield Window(grid, rows, slice(column, min(column + cells, grid.columns)))
-
-
-def _draw(cloud: Tiles, grid: Grid, fill: int, cells: int, heights: Any, colors: Any | None) -> None:
-    """Write the surface and, if wanted, the mean colours of its points."""
+def _draw(cloud: Tiles, grid: Grid, fill: int, cells: int, heights: Any, sources: Any, colors: Any | None) -> None:
+    """Write the surface, where it comes from and, if wanted, the mean colours of its points."""
     for window in windows(grid, cells):
         wide = window.wide(1 + fill)  # one cell for what stands apart, one for each pass that closes gaps
         seen = surface(_points_in(cloud, wide.grid), wide.grid, fill=fill)
@@ -198,6 +153,9 @@ def _draw(cloud: Tiles, grid: Grid, fill: int, cells: int, heights: Any, colors:
         if filled.any():
             shown = np.where(filled, seen.heights[inner], NODATA).astype(np.float32)
             heights.write(shown[None], window=window.place)
+            guessed = False if seen.predicted is None else seen.predicted[inner] > 0.5
+            source = np.where(seen.counts[inner] == 0, INTERPOLATED, np.where(guessed, PREDICTED, MEASURED))
+            sources.write(np.where(filled, source, 0).astype(np.uint8)[None], window=window.place)
             if colors is not None and seen.colors is not None:
                 colors.write(_bands(seen.colors[inner], (filled * 255).astype(np.uint8)), window=window.place)
 
@@ -206,12 +164,13 @@ def _points_in(cloud: Tiles, grid: Grid) -> Cloud:
     """What a surface needs of the points in a grid."""
     x_min, x_max, y_min, y_max = grid.extent
     low, high = np.array([x_min, y_min]) - grid.cell, np.array([x_max, y_max]) + grid.cell
-    found = [Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))]
+    found = [Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), predicted=np.zeros(0, bool))]
     for i, (least, most) in enumerate(cloud.bounds):
         if (least[:2] <= high).all() and (most[:2] >= low).all():
             tile = cloud.tile(i)
             near = ((tile.points[:, :2] >= low) & (tile.points[:, :2] <= high)).all(1)
-            found.append(Cloud(tile.points[near], None if tile.colors is None else tile.colors[near]))
+            kept = tile[np.asarray(near)]
+            found.append(Cloud(kept.points, kept.colors, predicted=kept.predicted))
     return concatenate(found)
 
 
@@ -233,20 +192,11 @@ def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path
     margin = int(np.ceil(painter.halo(cell) / grid.cell)) + 2
     with _raster(path, fine, crs, 4, "uint8") as photo:
         for window in windows(fine, cells):
-            around = _over(grid, window.grid).wide(margin)
+            around = window_over(grid, window.grid).wide(margin)
             below = heights.read(1, window=around.place)
             below = np.where(below == NODATA, np.nan, below)
             if np.isfinite(below).any():
                 photo.write(_bands(*painter.window(window.grid, around.grid, below)), window=window.place)
-
-
-def _over(grid: Grid, part: Grid) -> Window:
-    """The cells of a grid that a part of another one touches; at least one."""
-    x_min, x_max, y_min, y_max = part.extent
-    rows = [int(np.floor((grid.y_max - y) / grid.cell)) for y in (y_max, y_min)]
-    columns = [int(np.floor((x - grid.x_min) / grid.cell)) for x in (x_min, x_max)]
-    (top, bottom), (left, right) = np.clip(rows, 0, grid.rows - 1), np.clip(columns, 0, grid.columns - 1)
-    return Window(grid, slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1))
 
 
 def _bands(colors: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:

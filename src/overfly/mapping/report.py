@@ -12,6 +12,7 @@ from typing import Any
 
 from overfly import __version__
 from overfly.files import replacing
+from overfly.mapping.gaps import SOURCES
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ FILES = {
     "cloud.laz": "the point cloud: colour, confidence, sigma_m, views, predicted",
     "cloud.ply": "the same for mesh programs",
     "dsm.tif": "surface heights (GeoTIFF)",
+    "dsm_source.tif": "which of them are measured, predicted or interpolated (GeoTIFF, values 1, 2, 3)",
     "orthophoto.tif": "colours seen from straight above (GeoTIFF)",
     "mesh.glb": "the surface as a mesh, textured from the photographs (glTF, local coordinates)",
     "transforms.json": "the cameras used, in local metres east, north, up",
@@ -178,6 +180,10 @@ def _accuracy(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
             "predicted points are seen by less than two images: do not measure on them",
         )
     )
+    if (surface := summary.get("surface")) is not None:
+        shares = " / ".join(f"{surface[name]:.0%}" for name in SOURCES.values())
+        what = "of the surface model measured / predicted / interpolated: dsm_source.tif tells where"
+        rows.append(("Surface model", shares, what))
     if summary["metric"]:
         estimated = summary["cameras_from"] == "estimated"
         ruled = bool((summary.get("ground_control") or {}).get("controls"))

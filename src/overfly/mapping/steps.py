@@ -163,7 +163,10 @@ class Steps:
             yield update
 
 
-OWN = ("cloud.laz", "cloud.ply", "dsm.tif", "orthophoto.tif", "mesh.glb", "map.json", "report.html", "transforms.json")
+OWN = (
+    "cloud.laz", "cloud.ply", "dsm.tif", "dsm_source.tif", "orthophoto.tif", "mesh.glb", "map.json", "report.html",
+    "transforms.json",
+)  # fmt: skip
 
 
 def claim(out: Path, flight: Path, identity: str, *, overwrite: bool) -> Path:
