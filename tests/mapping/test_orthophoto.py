@@ -94,6 +94,13 @@ def test_one_frame_alone_leaves_blank_what_it_does_not_see(tmp_path: Path) -> No
     deep = shadow & (np.abs(xy[..., 1]) < 4 - 2 * FILL * 0.125 - 0.5) & (alpha < 255)
     assert deep.any()
     assert (alpha[deep] == 0).all()
+    again, covered = over(frames).window(FINE, grid, heights, np.ones(heights.shape, bool))
+    seen = alpha == 255
+    np.testing.assert_array_equal(again[seen], rgb[seen])
+    np.testing.assert_array_equal(covered == 255, seen)
+    shown = deep & (covered == FILLED)
+    assert xy[shown, 0].max() < xy[deep & ~shown, 0].min()  # the rest lies beyond the photograph
+    assert (~is_meadow(again))[shown].mean() > 0.9  # what hides it shows: the roof, twice
     assert not rgb[deep].any()
     assert (alpha == FILLED).any()
     seen = (alpha == 255) & ~beside_edge(xy, grid.cell)

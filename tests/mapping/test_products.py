@@ -65,7 +65,10 @@ class Checks:
     def halo(self, cell: float) -> float:
         return 3 * cell
 
-    def window(self, grid: Grid, around: Grid, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def window(
+        self, grid: Grid, around: Grid, heights: np.ndarray, doubtful: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert np.isfinite(heights[doubtful]).all()
         self.windows += 1
         at = around.cells(grid.centres().reshape(-1, 2))
         z = np.where(at >= 0, heights.ravel()[np.maximum(at, 0)], np.nan).reshape(grid.rows, grid.columns)

@@ -39,6 +39,9 @@ EDGE = 8
 RAMP = 4
 """A frame has its full weight from 1 / RAMP of the image's side from the border on."""
 
+AMID = 3
+"""Cells around doubtful ones that are as doubtful: single ones that were measured in a wood, deep between crowns."""
+
 NADIR = 0.5
 """Tangent off the vertical at which a frame is worth half of one that looks straight down."""
 
@@ -102,7 +105,9 @@ class Orthophoto:
         """
         return self._reach + (MARGIN + 1) * BLOCK * cell
 
-    def window(self, grid: Grid, surface: Grid, heights: NDArray) -> tuple[Image, NDArray[np.uint8]]:
+    def window(
+        self, grid: Grid, surface: Grid, heights: NDArray, doubtful: NDArray[np.bool_] | None = None
+    ) -> tuple[Image, NDArray[np.uint8]]:
         """The orthophoto of one window.
 
         Args:
@@ -110,12 +115,15 @@ class Orthophoto:
             surface: the surface model's grid over the window and its :meth:`halo`, as far as the surface goes.
                 The cells of both should stand on multiples of their size, or windows agree but for rounding.
             heights: [rows, columns] of ``surface``, NaN where empty.
+            doubtful: [rows, columns], cells of ``surface`` whose height, like that of :data:`AMID` cells around, is no
+                reason to leave them blank.
 
         Returns:
             RGB [rows, columns, 3] and alpha [rows, columns], both uint8. Alpha is 255 where a photograph sees the cell;
-            :data:`overfly.mapping.fill.FILLED` where none does and the colour is that of seen cells of the same
-            surface, at most twice :data:`overfly.mapping.fill.FILL` cells away; 0, and the colour black, where the
-            surface is empty or where all that is seen is farther: there no photograph tells the colour.
+            :data:`overfly.mapping.fill.FILLED` where none does: the colour is then that of seen cells of the same
+            surface, at most twice :data:`overfly.mapping.fill.FILL` cells away, or, of a doubtful cell, that of
+            whatever hides it; 0, and the colour black, where the surface is empty or where all that is seen is
+            farther: there no photograph tells the colour.
         """
         wide, inner = _widened(grid)
         fine = on_finer(heights, surface, wide)
@@ -127,10 +135,12 @@ class Orthophoto:
         lifts = [p.base[2] - p.level for p in ground]  # from the grid's heights to the block's frame
         known = heights[np.isfinite(heights)]
         low, high = (known.min() + min(lifts), known.max() + max(lifts)) if known.size else (0.0, 0.0)
+        here: dict[int, list[Chunk]] = {}
         for i in sorted(self._tree.query(window, predicate="dwithin", distance=near).tolist()):
             sight = self._sights[i]
             mine = [p for p in parts if sight.touches(p, near) and np.isfinite(fine[p.rows, p.columns]).any()]
             if mine:
+                here[i] = mine
                 between = sight.between(shapely.union_all([p.outline for p in mine]), low, high)
                 aside = near + sight.coarseness(surface.cell)
                 around = [p for p in ground if shapely.dwithin(between, p.outline, aside)]
@@ -138,6 +148,9 @@ class Orthophoto:
                 self._draw(i, wide.cell, fine, mine, sight.buffer(heights, surface.cell, around, stood), canvas)
         rgb, worth = canvas.blended()
         filled = fill(rgb, worth, fine, np.float32(STEP * surface.cell))
+        if doubtful is not None and doubtful.any():
+            unsure = on_finer(_grown(doubtful), surface, wide) >= 0.5
+            filled |= self._through(wide.cell, fine, here, rgb, unsure & (worth == 0) & ~filled & np.isfinite(fine))
         alpha = np.where(worth > 0, 255, np.where(filled, FILLED, 0)).astype(np.uint8)
         return np.ascontiguousarray(np.moveaxis(rgb, 0, -1)[inner]), alpha[inner].copy()
 
@@ -155,21 +168,15 @@ class Orthophoto:
         for part in parts:
             u, v, depth, slope = sight.ideal(part, part.x[None, :], part.y[:, None], fine[part.rows, part.columns])
             x, y = sight.pixels(u, v, camera)
-            with np.errstate(invalid="ignore"):
-                edge = np.minimum(
-                    np.minimum(x, camera.width - x) / np.float32(camera.width),
-                    np.minimum(y, camera.height - y) / np.float32(camera.height),
-                )
-                if not (edge > 0).any():
-                    continue
-                fineness = np.minimum(1, np.float32(cell * camera.fx) / depth)
-                value = np.clip(RAMP * edge, 0, 1) * fineness / (1 + slope / np.float32(NADIR**2))
+            value = _value(x, y, depth, slope, camera, cell)
+            if not value.any():
+                continue
             here = (
                 slice(part.rows.start - top, part.rows.stop - top),
                 slice(part.columns.start - left, part.columns.stop - left),
             )
             free[here][depths.hides(u, v, depth)] = 0
-            looks.append((part, here, x - np.float32(0.5), y - np.float32(0.5), np.where(value > 0, value, 0)))
+            looks.append((part, here, x - np.float32(0.5), y - np.float32(0.5), value))
         soft = _feathered(free) * np.float32(np.clip(self.gains.sharpness[i], 0.1, 1))
         canvas.begin()
         for part, here, x, y, value in looks:
@@ -177,6 +184,44 @@ class Orthophoto:
             if (worth > 0).any():
                 colors = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
                 canvas.draw((part.rows, part.columns), np.stack(cv2.split(colors)), worth)
+
+    def _through(
+        self, cell: float, fine: Map, here: dict[int, list[Chunk]], rgb: NDArray[np.uint8], left: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Colour cells that something hides in every frame from the frame that is worth most there, as if nothing did.
+
+        Between crowns of which few were measured that is the wood itself, which hides what was interpolated in it.
+
+        Args:
+            cell: side of the cells.
+            fine: heights [rows, columns].
+            here: the frames that touch the window, each with the parts that it touches.
+            rgb: [3, rows, columns], altered in place.
+            left: the cells asked for [rows, columns].
+
+        Returns:
+            The cells that were given a colour [rows, columns].
+        """
+        import cv2
+
+        best = np.zeros(left.shape, np.float32)
+        for i, parts in here.items():
+            sight = self._sights[i]
+            for part in parts:
+                at = part.rows, part.columns
+                if not left[at].any():
+                    continue
+                image, camera = self._image(i, cell)
+                u, v, depth, slope = sight.ideal(part, part.x[None, :], part.y[:, None], fine[at])
+                x, y = sight.pixels(u, v, camera)
+                value = _value(x, y, depth, slope, camera, cell)
+                better = left[at] & (value > best[at])
+                if better.any():
+                    half = np.float32(0.5)
+                    colors = cv2.remap(image, x - half, y - half, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                    rgb[(slice(None), *at)][:, better] = colors[better].T
+                    best[at][better] = value[better]
+        return best > 0
 
     def _image(self, i: int, cell: float) -> tuple[Image, Camera]:
         """A frame in its gains, and its camera; made smaller where its pixels are finer than cells."""
@@ -199,6 +244,32 @@ class Orthophoto:
         self._images.move_to_end(key)
         image = self._images[key]
         return image, lens.resized(image.shape[1], image.shape[0])
+
+
+def _grown(cells: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    import cv2
+
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), np.ones((2 * AMID + 1, 2 * AMID + 1), np.uint8)))
+
+
+def _value(x: Map, y: Map, depth: Map, slope: Map, camera: Camera, cell: float) -> Map:
+    """What a frame is worth for each cell, if nothing hides it: 0 outside the image.
+
+    Args:
+        x, y: pixels of the cells.
+        depth: along the optical axis.
+        slope: squared tangent off the vertical.
+        camera: of the image as it is drawn.
+        cell: side of the cells.
+    """
+    with np.errstate(invalid="ignore"):
+        edge = np.minimum(
+            np.minimum(x, camera.width - x) / np.float32(camera.width),
+            np.minimum(y, camera.height - y) / np.float32(camera.height),
+        )
+        fineness = np.minimum(1, np.float32(cell * camera.fx) / depth)
+        value = np.clip(RAMP * edge, 0, 1) * fineness / (1 + slope / np.float32(NADIR**2))
+        return np.where(value > 0, value, np.float32(0))
 
 
 def _widened(grid: Grid) -> tuple[Grid, tuple[slice, slice]]:

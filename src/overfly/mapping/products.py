@@ -49,9 +49,11 @@ class Painter(Protocol):
         """How far around a window of cells of that size it looks at the surface, in the grid's unit."""
         ...
 
-    def window(self, grid: Grid, surface: Grid, heights: NDArray) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def window(
+        self, grid: Grid, surface: Grid, heights: NDArray, doubtful: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """RGB [rows, columns, 3] and alpha [rows, columns] of the cells of ``grid``, from the surface model over it and
-        ``halo`` around it, NaN where empty."""
+        ``halo`` around it, NaN where empty, and which of its cells are interpolated."""
         ...
 
 
@@ -112,7 +114,7 @@ def raster_products(
             _draw(cloud, grid, fill, window, heights, sources, None)
         shares = close_gaps(heights, sources, grid, window)
         if painter is not None:
-            _paint(heights, grid, painter, grid.cell / parts, photo, level, window)
+            _paint(heights, sources, grid, painter, grid.cell / parts, photo, level, window)
     return grid, shares
 
 
@@ -174,7 +176,9 @@ def _points_in(cloud: Tiles, grid: Grid) -> Cloud:
     return concatenate(found)
 
 
-def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path, crs: str | None, cells: int) -> None:
+def _paint(
+    heights: Any, sources: Any, grid: Grid, make: PainterMaker, cell: float, path: Path, crs: str | None, cells: int
+) -> None:
     """Write the orthophoto in the colours of a painter, from the surface model that was written before."""
     known = OVERVIEW * grid.cell
     rows, columns = -(-grid.rows // OVERVIEW), -(-grid.columns // OVERVIEW)
@@ -196,7 +200,9 @@ def _paint(heights: Any, grid: Grid, make: PainterMaker, cell: float, path: Path
             below = heights.read(1, window=around.place)
             below = np.where(below == NODATA, np.nan, below)
             if np.isfinite(below).any():
-                photo.write(_bands(*painter.window(window.grid, around.grid, below)), window=window.place)
+                doubtful = sources.read(1, window=around.place) == INTERPOLATED
+                colors, alpha = painter.window(window.grid, around.grid, below, doubtful)
+                photo.write(_bands(colors, alpha), window=window.place)
 
 
 def _bands(colors: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
