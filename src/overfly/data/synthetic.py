@@ -2,60 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import logging
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
-from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from overfly.data.record import Record, cached
-from overfly.data.windows import window_camera
+from overfly.data.flight_job import FlightJob, record_flight
+from overfly.data.record import cached
 from overfly.errors import InputError, unknown
-from overfly.flights import CAMERAS, PATHS, camera_preset, plan_flight
-from overfly.scenes import STYLES, Appearance, Renderer, make_scene
+from overfly.flights import CAMERAS, PATHS
+from overfly.scenes import STYLES
 
 log = logging.getLogger("overfly")
 
 SPLITS = ("train", "val", "test", "unseen")
-
-
-@dataclass(frozen=True, kw_only=True)
-class FlightJob:
-    """All that one rendered flight depends on; plain values, so that it can be a key and cross processes."""
-
-    style: str
-    seed: int
-    scene: int
-    altitude: float
-    overlap: float
-    side_overlap: float
-    flight_path: dict[str, Any]
-    camera: str
-    image_size: tuple[int, int]
-    images: int
-    supersample: int
-
-    @property
-    def key(self) -> str:
-        """A hash of every value and of the code that renders: another value or another code is another flight."""
-        content = json.dumps({**asdict(self), "code": _code()}, sort_keys=True)
-        return hashlib.sha256(content.encode()).hexdigest()[:20]
-
-
-@lru_cache(maxsize=1)
-def _code() -> str:
-    """A hash of the modules that decide what a flight looks like."""
-    package = Path(__file__).resolve().parents[1]
-    files = [*sorted((package / "scenes").glob("*.py")), *sorted((package / "flights").glob("*.py"))]
-    files += [package / "geometry.py", package / "data" / "windows.py", Path(__file__)]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 class SyntheticFlights:
@@ -63,7 +27,8 @@ class SyntheticFlights:
 
     ``train``, ``val`` and ``test`` fly over different scenes of the same styles, ``unseen`` over other styles. Flights
     take turns over styles and cells (altitude, overlap, path); each holds ``images_per_flight`` frames, the last of a
-    cell what is left.
+    cell what is left. Instead of a style a list may name a file that :func:`overfly.scenes.load_scene` reads, such as
+    a coloured lidar cloud: its landscape is flown over again and again, each time from elsewhere.
 
     Raises:
         InputError: a style, path or camera is unknown, or a count is not possible.
@@ -90,8 +55,8 @@ class SyntheticFlights:
         processes: int,
     ) -> None:
         for style in [*styles, *unseen_styles]:
-            if style not in STYLES:
-                raise unknown("The style", style, STYLES)
+            if style not in STYLES and not Path(style).expanduser().is_file():
+                raise unknown("The style", style, [*STYLES, "a file of a scene (.laz, .ply, .tif, ...)"])
         paths = [{"name": name} for name in flight_paths] if flight_paths else [dict(flight_path)]
         for path in paths:
             if path["name"] not in PATHS:
@@ -141,10 +106,13 @@ class SyntheticFlights:
                 left[number] -= images
                 scene = SPLITS.index(split) * 100_000 + len(jobs)
                 side = cell["overlap"] if self.side_overlap is None else self.side_overlap
+                # Shifted by one every turn, or a cell would see one style only.
+                style = self.styles[split][(number + turn) % len(self.styles[split])]
+                file = None if style in STYLES else Path(style).expanduser().stat()
                 jobs.append(
                     FlightJob(
-                        # Shifted by one every turn, or a cell would see one style only.
-                        style=self.styles[split][(number + turn) % len(self.styles[split])],
+                        style=style,
+                        file=None if file is None else (file.st_size, file.st_mtime_ns),
                         seed=self.seed * 1_000_003 + scene,
                         scene=scene,
                         altitude=float(cell["altitude"]),
@@ -225,66 +193,3 @@ def _progress(steps: Iterator[int], total: int, title: str) -> Iterator[int]:
         for step in steps:
             bar.advance(task, step)
             yield step
-
-
-def record_flight(job: FlightJob) -> Record:
-    """Make the scene, plan the flight, photograph it: one record, the same for the same job on every machine."""
-    rng = np.random.default_rng(job.seed)
-    camera = window_camera(camera_preset(job.camera), *job.image_size)
-    width = 2 * job.altitude * np.tan(np.radians(camera.fov_deg[0] / 2))
-    size_m = float(np.clip(3.0 * width, 200, 2000))
-    scene = make_scene(job.style, job.seed, size_m=size_m)
-    low, high = scene.bounds
-    plans = []
-    frames = 0
-    for attempt in range(40):
-        if frames >= job.images:
-            break
-        # Half the scene is flown over, so that no footprint reaches beyond it.
-        half = (0.25, 0.2, 0.15)[attempt % 3] * size_m
-        middle = (low[:2] + high[:2]) / 2 + rng.uniform(-0.05, 0.05, 2) * size_m
-        plan = plan_flight(
-            job.flight_path["name"],
-            (middle[0] - half, middle[1] - half, middle[0] + half, middle[1] + half),
-            altitude=job.altitude,
-            overlap=job.overlap,
-            side_overlap=job.side_overlap,
-            camera=camera,
-            ground=scene.ground,
-            rng=rng,
-            frames=max(2, job.images - frames),
-            **{key: value for key, value in job.flight_path.items() if key != "name"},
-        )
-        plans.append(plan)
-        frames += len(plan)
-    if frames < job.images:
-        raise InputError(
-            f"A {job.flight_path['name']} flight at {job.altitude:g} m with {job.overlap:g} % overlap has only "
-            f"{frames} frames in this scene: ask for at most {frames} images_per_flight."
-        )
-    poses = np.concatenate([plan.world_from_camera for plan in plans])[: job.images]
-    strips = np.concatenate([1000 * i + plan.strip for i, plan in enumerate(plans)])[: job.images]
-    renderer = Renderer(scene)
-    appearance = Appearance(
-        sun_azimuth_deg=float(rng.uniform(0, 360)), sun_elevation_deg=float(rng.uniform(30, 70)), noise_std=2.0
-    )
-    shots = [
-        renderer.render(camera, pose, supersample=job.supersample, appearance=appearance, rng=rng) for pose in poses
-    ]
-    cell = max(0.25, width / job.image_size[0] / 2)
-    heights = renderer.height_map(float(low[0]), float(low[1]), float(high[0]), float(high[1]), cell)
-    return Record(
-        images=np.stack([shot.image for shot in shots]),
-        depth=np.stack([shot.depth for shot in shots]),
-        world_from_camera=poses,
-        cameras=[camera] * job.images,
-        strips=strips.astype(np.int64),
-        heights=heights,
-        corner=(float(low[0]), float(high[1]), cell),
-        ground_height=float(np.mean([plan.ground_height for plan in plans])),
-        facts={
-            **asdict(job),
-            "flight_path": job.flight_path["name"],
-            "measured_overlap": [plan.measured_overlap for plan in plans],
-        },
-    )

@@ -1,0 +1,67 @@
+"""Synthetic flights: over procedural styles and over the user's own scenes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from overfly.cloud import Cloud, write_cloud
+from overfly.data.record import read_record
+from overfly.data.synthetic import SyntheticFlights
+from overfly.errors import InputError
+from overfly.geometry import unproject
+
+
+def flights(tmp_path: Path, **changes: Any) -> SyntheticFlights:
+    settings: dict[str, Any] = {
+        "styles": ["suburb"], "unseen_styles": [], "images": {"test": 4}, "images_per_flight": 4, "cells": None,
+        "altitude": 60, "overlap": 60, "side_overlap": None, "flight_path": {"name": "grid"}, "flight_paths": None,
+        "camera": "mavic3e", "image_size": (64, 48), "supersample": 1, "seed": 3, "cache_dir": str(tmp_path / "cache"),
+        "processes": 1,
+    }  # fmt: skip
+    return SyntheticFlights(**settings | changes)
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A level field of 300 x 200 m, 30 m over zero, with a hall 12 m high in the middle: a coloured cloud."""
+    x, y = np.meshgrid(np.arange(0.5, 300), np.arange(0.5, 200))
+    z = np.where((np.abs(x - 150) < 20) & (np.abs(y - 100) < 15), 42.0, 30.0)
+    points = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    path = tmp_path_factory.mktemp("scene") / "hall.laz"
+    write_cloud(Cloud(points, np.full(points.shape, (90, 120, 60), np.uint8)), path)
+    return path
+
+
+@pytest.mark.parametrize("altitude", [60, 300])
+def test_a_scene_from_a_file_is_flown_over_where_it_is(hall: Path, tmp_path: Path, altitude: float) -> None:
+    source = flights(tmp_path, styles=[str(hall)], altitude=altitude, overlap=80)
+    (folder,) = source.prepare("test")
+    record = read_record(folder)
+    assert len(record) == 4
+    seen = record.depth > 0
+    assert seen.mean() == 1 if altitude == 60 else 0.1 < seen.mean() < 0.9  # from 300 m beyond its ends, too
+    heights = []
+    for depth, camera, pose in zip(record.depth, record.cameras, record.world_from_camera, strict=True):
+        rows, columns = np.nonzero(depth > 0)
+        pixels = np.stack([columns + 0.5, rows + 0.5], 1)
+        heights.append(unproject(pixels, depth[rows, columns], camera, pose)[:, 2])
+    assert np.quantile(np.concatenate(heights), [0.02, 0.995]) == pytest.approx([30, 42], abs=0.3)
+    assert record.ground_height == pytest.approx(30, abs=1.5)
+    assert np.median(record.world_from_camera[:, 2, 3]) == pytest.approx(30 + altitude, abs=2)
+
+
+def test_another_file_of_the_same_name_is_another_flight(hall: Path, tmp_path: Path) -> None:
+    first = flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key
+    assert flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key == first
+    os.utime(hall, ns=(1, 1))
+    assert flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key != first
+
+
+def test_neither_a_style_nor_a_file_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"'suburbs' is unknown; did you mean 'suburb'\?.*a file of a scene"):
+        flights(tmp_path, styles=["suburbs"])
