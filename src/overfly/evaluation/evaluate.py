@@ -17,6 +17,7 @@ from overfly.data.dataset import WindowDataset
 from overfly.evaluation.answers import Baselines, Batch, Network
 from overfly.evaluation.chart import draw
 from overfly.evaluation.measure import Values, cloud_values, surface_values, truths
+from overfly.evaluation.paired import paired
 from overfly.evaluation.table import Row, tabulate, write_table
 from overfly.files import replacing
 from overfly.networks.verification import GroundViews, agreement, ground_views
@@ -109,6 +110,8 @@ def measure(
     ``encoders`` what retrieval needs from each network.
     """
     answers = {**baselines(batch), **{name: network(batch) for name, network in networks.items()}}
+    surfaces = [name for name in networks if answers[name].sigma is not None]
+    answers |= {f"{name}, with pairs": paired(answers[name], batch) for name in surfaces}
     known = truths(batch)
     windows: list[dict[str, Any]] = [
         {"index": int(index), "scene": int(scene), "clouds": {}, "calibration": {}, "encoders": {}}

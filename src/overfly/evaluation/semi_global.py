@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from overfly.geometry import Array, Camera
+from overfly.geometry import Camera
 from overfly.mapping.consensus import consensus
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.rectify import ordered, rectify
+from overfly.mapping.subpixel import Shot
 from overfly.networks.baselines import interpolated
 from overfly.networks.correlation import LUMA, Heights
 from overfly.networks.ground import pixel_centres, rays
@@ -37,9 +38,10 @@ def semi_global(batch: Mapping[str, Tensor]) -> Heights:
     feet = rays(cells, batch["intrinsics"][:, 0].cpu(), batch["camera_from_window"][:, 0].cpu()).foot[..., :2].numpy()
     found, measured = [], []
     for number in range(len(batch["images"])):
-        window = {name: batch[name][number].cpu() for name in ("images", "intrinsics", "camera_from_window")}
+        window = one_window(batch, number)
         low, high = (float(x) for x in batch["height_range"][number])
-        surface = _heights(window, (low, high))
+        frames = shots(window)
+        surface = pair_depth(frames, window, (low, high))[0] * rise(frames[0]) + frames[0].world_from_camera[2, 3]
         known = np.isfinite(surface) & (surface >= low) & (surface <= high)
         surface = np.where(known, surface, 0.0)
         if known.any():
@@ -53,20 +55,34 @@ def semi_global(batch: Mapping[str, Tensor]) -> Heights:
     )
 
 
-def _heights(window: Mapping[str, Tensor], height_range: tuple[float, float]) -> NDArray[np.float64]:
-    """Height of each pixel of the reference [H, W], window units, NaN where no pair knows it."""
+def one_window(batch: Mapping[str, Tensor], number: int) -> dict[str, Tensor]:
+    """What stereo needs of one window of a batch."""
+    return {name: batch[name][number].cpu() for name in ("images", "intrinsics", "camera_from_window")}
+
+
+def shots(window: Mapping[str, Tensor]) -> list[Shot]:
+    """The frames of one window, on the CPU: gray values in whole steps, window_from_camera as pose."""
     _, _, height, width = window["images"].shape
     shape = torch.tensor(LUMA)[:, None, None]
-    grays = [((image * shape).sum(0) * 255).round().byte().numpy() for image in window["images"]]
+    grays = [((image * shape).sum(0) * 255).round().numpy().astype(np.float32) for image in window["images"]]
     cameras = [
         Camera(width, height, *(float(k[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))) for k in window["intrinsics"]
     ]
-    poses = inverse(window["camera_from_window"].double()).numpy()  # window_from_camera
+    return [Shot(*each) for each in zip(grays, cameras, inverse(window["camera_from_window"].double()).numpy())]
+
+
+def pair_depth(
+    frames: Sequence[Shot], window: Mapping[str, Tensor], height_range: tuple[float, float]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth of each pixel of the reference [H, W], window units, NaN where no pair knows it; how many pairs agree."""
+    grays = [frame.gray.astype(np.uint8) for frame in frames]
+    cameras, poses = [frame.camera for frame in frames], [frame.world_from_camera for frame in frames]
+    height, width = grays[0].shape
     ranges = [_depth_range(window, k, height_range) for k in range(len(cameras))]
     depths, sigmas = [], []
     for other in range(1, len(cameras)):
-        base = np.linalg.norm(poses[other, :3, 3] - poses[0, :3, 3])
-        if base < NO_BASE * abs(poses[0, 2, 3]):
+        base = np.linalg.norm(poses[other][:3, 3] - poses[0][:3, 3])
+        if base < NO_BASE * abs(poses[0][2, 3]):
             continue  # the same frame again
         left, right = (0, other) if ordered((poses[0], poses[other])) else (other, 0)
         pair = rectify((cameras[left], cameras[right]), (poses[left], poses[right]), (ranges[left], ranges[right]))
@@ -80,18 +96,17 @@ def _heights(window: Mapping[str, Tensor], height_range: tuple[float, float]) ->
         depths.append(depth)
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (pair.focal * pair.baseline)))
     if not depths:
-        return np.full((height, width), np.nan)
-    depth = consensus(depths, sigmas)[0]
-    return _lifted(depth, cameras[0], poses[0])
+        return np.full((height, width), np.nan, np.float32), np.zeros((height, width), np.uint8)
+    depth, _, support = consensus(depths, sigmas)
+    return depth, support
 
 
-def _lifted(depth: NDArray[np.float32], camera: Camera, window_from_camera: Array) -> NDArray[np.float64]:
-    """Height of the points at depths [H, W] of a camera's pixels."""
+def rise(frame: Shot) -> NDArray[np.float64]:
+    """Height gained per unit of depth along the ray of each pixel [H, W]; negative where it goes down."""
+    camera, third = frame.camera, frame.world_from_camera[2]
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height)[:, None] + 0.5 - camera.cy) / camera.fy
-    third = window_from_camera[2]
-    heights: NDArray[np.float64] = depth * (third[0] * x + third[1] * y + third[2]) + third[3]
-    return heights
+    return np.asarray(third[0] * x + third[1] * y + third[2])
 
 
 def _depth_range(window: Mapping[str, Tensor], frame: int, height_range: tuple[float, float]) -> tuple[float, float]:

@@ -1,0 +1,54 @@
+"""A network's surface, after pairs and correlation have had their say."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from overfly.evaluation.answers import Answer, on_grid
+from overfly.evaluation.paired import GATE, paired
+from overfly.evaluation.semi_global import semi_global
+from overfly.stages.surfaces import true_heights
+from terrain import make_batch
+
+WIDTH, HEIGHT = 128, 64
+
+
+def windows() -> tuple[dict[str, Tensor], Tensor]:
+    batch = make_batch(1, width=WIDTH, height=HEIGHT, points=256, frames=4)
+    true, _ = true_heights(batch, WIDTH, HEIGHT)
+    return batch, true
+
+
+def said(batch: dict[str, Tensor], height: Tensor, sigma: float) -> Answer:
+    return Answer(on_grid(height, batch, 256), height, torch.full_like(height, sigma), torch.full_like(height, 0.5))
+
+
+def test_a_surface_that_is_half_a_pixel_off_comes_nearer() -> None:
+    batch, true = windows()
+    off = said(batch, true + 0.01, sigma=0.02)
+    better = paired(off, batch)
+    before, after = ((answer.height - true).abs() for answer in (off, better))
+    moved = better.height != off.height  # the others are seen once
+    assert 0.3 < moved.float().mean() < 0.9
+    assert after[moved].median() < 0.5 * before[moved].median()
+    assert after.mean() < before.mean()
+    assert torch.equal(better.points, on_grid(better.height, batch, 256))
+    assert better.confidence is off.confidence
+
+
+def test_one_pair_is_not_believed_far_from_what_the_network_is_sure_of() -> None:
+    batch, true = windows()
+    wrong = true + 0.5
+    sure, unsure = (paired(said(batch, wrong, sigma), batch).height for sigma in (0.5 / GATE / 10, 10.0))
+    matched = semi_global(batch).measured
+    right = [((height - true).abs() < 0.02)[matched].float().mean() for height in (sure, unsure)]
+    assert right[1] > 0.8
+    assert right[0] < right[1] - 0.1  # two pairs that agree stand in any case
+
+
+def test_nothing_but_images_and_cameras_is_looked_at() -> None:
+    batch, true = windows()
+    blind = {**batch, "depth": torch.ones_like(batch["depth"]), "reference": torch.zeros_like(batch["reference"])}
+    answer = said(batch, true + 0.02, 0.1)
+    assert torch.equal(paired(answer, batch).height, paired(answer, blind).height)
