@@ -26,14 +26,12 @@ def run(tmp_path: Path) -> Path:
     network = make_sweep_network()
     network.generator.steps += 30
     state = {f"network.{key}": value for key, value in network.state_dict().items()}
-    torch.save({"state_dict": state}, folder / "checkpoints" / "best.ckpt")
+    torch.save({"state_dict": state, "epoch": 1}, folder / "checkpoints" / "best.ckpt")
     config = {"model": TINY, "frames": 3, "image_size": [64, 32], "seed": 7, "stage_name": "full"}
     OmegaConf.save(config, folder / "config.yaml")
     (folder / "overrides.txt").write_text("experiment=tiny\nhydra.run.dir=elsewhere\n")
-    metrics = {
-        "phases": {"gan": {"metrics": {"val/loss": 9.0}}, "full": {"metrics": {"val/loss": 1.5, "train/loss": 1}}}
-    }
-    (folder / "metrics.json").write_text(json.dumps(metrics))
+    table = "stage,epoch,train/loss,val/loss,val/late\ngan,1,3,9.0,\nfull,0,2,4.0,\nfull,1,1,1.5,\nfull,2,0.5,2.5,7\n"
+    (folder / "metrics.csv").write_text(table)
     return folder
 
 
@@ -52,7 +50,7 @@ def test_the_command_the_seed_and_the_scores_stand_beside_the_weights(run: Path,
     facts = json.loads(described.read_text())
     assert facts["command"] == "python train.py experiment=tiny"
     assert facts["seed"] == 7
-    assert facts["scores"] == {"val/loss": 1.5}
+    assert facts["scores"] == {"val/loss": 1.5}  # of the best epoch, not of the last one
     assert facts["steps"]["generator"] == 30
 
 

@@ -5,6 +5,7 @@ They lie in ``overfly/weights`` as ``NAME.safetensors`` and ``NAME.json``; ``ove
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,7 @@ def export(run_folder: Path | str, out: Path | str, name: str = DEFAULT) -> tupl
         "seed": config.seed,
         "command": " ".join(["python train.py", *overrides]),
         "steps": {part: int(getattr(run.network, part).steps) for part in ("encoder", "generator", "discriminator")},
-        "scores": _scores(found.parent.parent / "metrics.json"),
+        "scores": _scores(found),
     }
     out.mkdir(parents=True, exist_ok=True)
     weights, described = out / f"{name}.safetensors", out / f"{name}.json"
@@ -94,9 +95,15 @@ def _lines(path: Path) -> list[str]:
     return [line for line in path.read_text().splitlines() if line] if path.is_file() else []
 
 
-def _scores(path: Path) -> dict[str, float]:
-    """The validation figures of a finished run, of its last phase where it had several."""
-    content = json.loads(path.read_text()) if path.is_file() else {}
-    last = list(content.get("phases", {"": content}).values())[-1]
-    metrics = last.get("metrics", {})
-    return {key: round(value, 6) for key, value in metrics.items() if key.startswith("val/")}
+def _scores(weights: Path) -> dict[str, float]:
+    """The validation figures of the epoch after which a checkpoint was written, of the last phase that has it."""
+    import torch
+
+    epoch = torch.load(weights, map_location="cpu", weights_only=True).get("epoch")
+    table = weights.parent.parent / "metrics.csv"
+    if epoch is None or not table.is_file():
+        return {}
+    with table.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if float(row["epoch"]) == epoch]
+    values = rows[-1].items() if rows else []
+    return {key: round(float(value), 6) for key, value in values if key.startswith("val/") and value}
