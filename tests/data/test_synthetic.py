@@ -37,14 +37,14 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("altitude", [60, 300])
+@pytest.mark.parametrize("altitude", [60, 240])
 def test_a_scene_from_a_file_is_flown_over_where_it_is(hall: Path, tmp_path: Path, altitude: float) -> None:
     source = flights(tmp_path, styles=[str(hall)], altitude=altitude, overlap=80)
     (folder,) = source.prepare("test")
     record = read_record(folder)
     assert len(record) == 4
     seen = record.depth > 0
-    assert seen.mean() == 1 if altitude == 60 else 0.1 < seen.mean() < 0.9  # from 300 m beyond its ends, too
+    assert seen.mean() == 1 if altitude == 60 else 0.1 < seen.mean() < 0.9  # from 240 m beyond its ends, too
     heights = []
     for depth, camera, pose in zip(record.depth, record.cameras, record.world_from_camera, strict=True):
         rows, columns = np.nonzero(depth > 0)
@@ -55,11 +55,28 @@ def test_a_scene_from_a_file_is_flown_over_where_it_is(hall: Path, tmp_path: Pat
     assert np.median(record.world_from_camera[:, 2, 3]) == pytest.approx(30 + altitude, abs=2)
 
 
+@pytest.mark.parametrize("path", ["circular", "random"])
+def test_no_frame_looks_past_a_scene_from_a_file(hall: Path, tmp_path: Path, path: str) -> None:
+    settings = {"images": {"test": 16}, "images_per_flight": 16, "flight_path": {"name": path}}
+    (folder,) = flights(tmp_path, styles=[str(hall)], **settings).prepare("test")
+    record = read_record(folder)
+    assert len(record) == 16
+    assert (record.depth > 0).mean((1, 2)).min() > 0.45
+
+
+def test_a_scene_that_is_too_small_for_the_flight_is_one_sentence(hall: Path, tmp_path: Path) -> None:
+    source = flights(tmp_path, styles=[str(hall)], altitude=450, overlap=30)
+    with pytest.raises(InputError, match=r"only 0 frames over this scene.*fly lower or overlap more"):
+        source.prepare("test")
+
+
 def test_another_file_of_the_same_name_is_another_flight(hall: Path, tmp_path: Path) -> None:
     first = flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key
     assert flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key == first
+    (hall.parent / "orthophoto.tif").write_bytes(b"other colours")
+    colored = flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key
     os.utime(hall, ns=(1, 1))
-    assert flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key != first
+    assert len({first, colored, flights(tmp_path, styles=[str(hall)]).jobs("test")[0].key}) == 3
 
 
 def test_neither_a_style_nor_a_file_is_one_sentence(tmp_path: Path) -> None:

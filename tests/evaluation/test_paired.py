@@ -52,3 +52,13 @@ def test_nothing_but_images_and_cameras_is_looked_at() -> None:
     blind = {**batch, "depth": torch.ones_like(batch["depth"]), "reference": torch.zeros_like(batch["reference"])}
     answer = said(batch, true + 0.02, 0.1)
     assert torch.equal(paired(answer, batch).height, paired(answer, blind).height)
+
+
+def test_a_frame_that_a_short_window_repeats_counts_once() -> None:
+    batch, true = windows()
+    frames = ("images", "depth", "intrinsics", "camera_from_window")
+    short = {name: value[:, :2] if name in frames else value for name, value in batch.items()}
+    padded = {name: value[:, [0, 1, 0, 1]] if name in frames else value for name, value in batch.items()}
+    answers = [paired(said(batch, true + 0.01, 0.02), window).height for window in (short, padded)]
+    assert torch.equal(*answers)
+    assert not torch.equal(answers[0], true + 0.01)

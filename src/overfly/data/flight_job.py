@@ -14,7 +14,8 @@ import numpy as np
 from overfly.data.record import Record
 from overfly.data.windows import window_camera
 from overfly.errors import InputError
-from overfly.flights import camera_preset, plan_flight
+from overfly.flights import Plan, camera_preset, plan_flight
+from overfly.geometry import Camera
 from overfly.scenes import Appearance, Renderer, Scene, load_scene, make_scene
 
 
@@ -33,8 +34,8 @@ class FlightJob:
     image_size: tuple[int, int]
     images: int
     supersample: int
-    file: tuple[int, int] | None = None
-    """Size and time of change of the file that ``style`` names, if it is one."""
+    file: tuple[tuple[int, int], ...] | None = None
+    """Size and time of change of the file that ``style`` names, if it is one, and of what gives it its colours."""
 
     @property
     def key(self) -> str:
@@ -52,10 +53,27 @@ def _code() -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
+COVERED, MORE = 0.5, 4
+"""Share of an image that must show the scene of a file, which ends somewhere; frames planned for each one wanted."""
+
+
+def scene_version(path: Path) -> tuple[tuple[int, int], ...]:
+    """Size and time of change of a scene's file and of the orthophotos beside it that may colour it."""
+    beside = (path, path.with_name(f"{path.stem}_ortho.tif"), path.with_name("orthophoto.tif"))
+    stats = [file.stat() for file in beside if file.is_file()]
+    return tuple((stat.st_size, stat.st_mtime_ns) for stat in stats)
+
+
 @lru_cache(maxsize=1)
-def _loaded(path: Path, version: tuple[int, int]) -> Scene:
-    """The scene of a file, read once for all flights over it."""
+def _loaded(path: Path, version: tuple[tuple[int, int], ...]) -> Scene:
+    """The scene of a file, read once for flights over it that follow each other."""
     return load_scene(path)
+
+
+def _over_scene(renderer: Renderer, camera: Camera, plan: Plan) -> list[bool]:
+    """Which frames of a plan show the scene on at least :data:`COVERED` of their image."""
+    small = camera.resized(32, 24)
+    return [bool((renderer.depth(small, pose) > 0).mean() >= COVERED) for pose in plan.world_from_camera]
 
 
 def record_flight(job: FlightJob) -> Record:
@@ -73,12 +91,12 @@ def record_flight(job: FlightJob) -> Record:
         scene = _loaded(Path(job.style).expanduser(), job.file)
         x_min, y_min, x_max, y_max = scene.extent
         size = np.array([x_max - x_min, y_max - y_min])
-        # As far as footprints stay inside; where they are larger than the scene, images show some of what lies beyond.
         footprint = width * np.array([1, job.image_size[1] / job.image_size[0]])
         halves = [np.maximum(share * (size - footprint), 0.1 * size) for share in (0.5, 0.4, 0.3)]
-        wander = 0.1 * size
+        wander = 0.05 * size
     low, high = scene.bounds
-    plans = []
+    renderer = Renderer(scene)
+    plans, chosen = [], []
     frames = 0
     for attempt in range(40):
         if frames >= job.images:
@@ -94,19 +112,20 @@ def record_flight(job: FlightJob) -> Record:
             camera=camera,
             ground=scene.ground,
             rng=rng,
-            frames=max(2, job.images - frames),
+            frames=max(2, (job.images - frames) * (1 if job.file is None else MORE)),
             **{key: value for key, value in job.flight_path.items() if key != "name"},
         )
         plans.append(plan)
-        frames += len(plan)
+        chosen.append([True] * len(plan) if job.file is None else _over_scene(renderer, camera, plan))
+        frames += sum(chosen[-1])
     if frames < job.images:
         raise InputError(
             f"A {job.flight_path['name']} flight at {job.altitude:g} m with {job.overlap:g} % overlap has only "
-            f"{frames} frames in this scene: ask for at most {frames} images_per_flight."
+            f"{frames} frames over this scene: ask for at most {frames} images_per_flight, fly lower or overlap more."
         )
-    poses = np.concatenate([plan.world_from_camera for plan in plans])[: job.images]
-    strips = np.concatenate([1000 * i + plan.strip for i, plan in enumerate(plans)])[: job.images]
-    renderer = Renderer(scene)
+    kept = np.concatenate(chosen)
+    poses = np.concatenate([plan.world_from_camera for plan in plans])[kept][: job.images]
+    strips = np.concatenate([1000 * i + plan.strip for i, plan in enumerate(plans)])[kept][: job.images]
     appearance = Appearance(
         sun_azimuth_deg=float(rng.uniform(0, 360)), sun_elevation_deg=float(rng.uniform(30, 70)), noise_std=2.0
     )

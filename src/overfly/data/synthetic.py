@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from overfly.data.flight_job import FlightJob, record_flight
+from overfly.data.flight_job import FlightJob, record_flight, scene_version
 from overfly.data.record import cached
 from overfly.errors import InputError, unknown
 from overfly.flights import CAMERAS, PATHS
@@ -108,11 +108,11 @@ class SyntheticFlights:
                 side = cell["overlap"] if self.side_overlap is None else self.side_overlap
                 # Shifted by one every turn, or a cell would see one style only.
                 style = self.styles[split][(number + turn) % len(self.styles[split])]
-                file = None if style in STYLES else Path(style).expanduser().stat()
+                file = None if style in STYLES else scene_version(Path(style).expanduser())
                 jobs.append(
                     FlightJob(
                         style=style,
-                        file=None if file is None else (file.st_size, file.st_mtime_ns),
+                        file=file,
                         seed=self.seed * 1_000_003 + scene,
                         scene=scene,
                         altitude=float(cell["altitude"]),

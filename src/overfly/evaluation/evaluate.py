@@ -29,6 +29,9 @@ log = logging.getLogger("overfly")
 KEPT = "windows.jsonl"
 """File of the run folder with the measurements of one window a line, by which a stopped evaluation goes on."""
 
+FORM = 2
+"""Of a line in that file: counts up when other methods or metrics are measured, so that older lines do not count."""
+
 GROUPS = {"test": "seen", "unseen": "unseen"}
 """What a split's styles are to the networks."""
 
@@ -114,7 +117,7 @@ def measure(
     answers |= {f"{name}, with pairs": paired(answers[name], batch) for name in surfaces}
     known = truths(batch)
     windows: list[dict[str, Any]] = [
-        {"index": int(index), "scene": int(scene), "clouds": {}, "calibration": {}, "encoders": {}}
+        {"form": FORM, "index": int(index), "scene": int(scene), "clouds": {}, "calibration": {}, "encoders": {}}
         for index, scene in zip(batch["index"], batch["scene"], strict=True)
     ]
     for name, answer in answers.items():
@@ -189,7 +192,7 @@ def _facts(dataset: WindowDataset, index: int) -> dict[str, Any]:
 
 
 def _read(path: Path, networks: set[str]) -> dict[tuple[str, int], dict[str, Any]]:
-    """What a stopped evaluation has measured; a line that was not finished, or of other networks, does not count."""
+    """What a stopped evaluation has measured; unfinished lines and those of other networks or methods do not count."""
     splits = {group: split for split, group in GROUPS.items()}
     kept: dict[tuple[str, int], dict[str, Any]] = {}
     lines = path.read_text().splitlines() if path.is_file() else []
@@ -198,7 +201,7 @@ def _read(path: Path, networks: set[str]) -> dict[tuple[str, int], dict[str, Any
             window = json.loads(line)
         except json.JSONDecodeError:
             continue
-        if set(window["encoders"]) == networks:
+        if set(window["encoders"]) == networks and window.get("form") == FORM:
             kept[splits[window["split"]], window["index"]] = window
     return kept
 

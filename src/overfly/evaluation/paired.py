@@ -1,4 +1,4 @@
-"""A network's surface as maps take it: pairs decide where they match, and correlation finds the last of a pixel."""
+"""A network's surface beside pairs, much as maps take the two: pairs decide where they match, correlation the rest."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ GATE = 3.0
 
 
 def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
-    """The answer of a network that tells a surface with sigma, after what :mod:`overfly.mapping.stereo` does with it.
+    """The answer of a network that tells a surface with sigma, corrected by pairs and by correlation.
 
+    As :mod:`overfly.mapping.stereo` does, but that there the network never overrules a pair: other frames' maps do.
     Where pairs have matched and all frames correlate there, their refined depth stands, if two pairs agree or it lies
     within :data:`GATE` of the network's sigma; else the network's does, refined where it correlates. Sigma and
     confidence stay those of the network.

@@ -19,6 +19,7 @@ from overfly.networks.correlation import LUMA, Heights
 from overfly.networks.ground import pixel_centres, rays
 from overfly.networks.poses import inverse
 from overfly.networks.sweep import NO_BASE
+from overfly.stages.supervision import repeated
 
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels."""
@@ -56,8 +57,11 @@ def semi_global(batch: Mapping[str, Tensor]) -> Heights:
 
 
 def one_window(batch: Mapping[str, Tensor], number: int) -> dict[str, Tensor]:
-    """What stereo needs of one window of a batch."""
-    return {name: batch[name][number].cpu() for name in ("images", "intrinsics", "camera_from_window")}
+    """What stereo needs of one window of a batch, every frame once: short windows repeat some."""
+    window = {name: batch[name][number].cpu() for name in ("images", "intrinsics", "camera_from_window")}
+    poses = {"camera_from_window": window["camera_from_window"][None]}
+    new = ~repeated(poses)[0].tril(-1).any(-1)
+    return {name: value[new] for name, value in window.items()}
 
 
 def shots(window: Mapping[str, Tensor]) -> list[Shot]:

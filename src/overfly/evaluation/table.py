@@ -47,6 +47,7 @@ One row for each cloud in each cell (styles that the networks have seen or not, 
 with `all` summarise. Numbers are means over windows; [low, high] is the 95 % confidence interval of a bootstrap over
 scenes (one scene is one flight), given from {least} scenes on; evaluation.csv holds it for every column.
 
+- `NETWORK, with pairs`: its surface, where semi-global pairs do not know better, and correlated in all frames.
 - `chamfer_sum_1024`: the paper's Eq. 2 in the frame where the footprint spans [-1, 1]; `chamfer_m2`: both mean squared
   distances added, m²; `excess_removed`: the removed share of flat ground's Chamfer excess over the exact heights.
 - `emd_sum_1024`: the paper's Eq. 3, on some of the windows. `fscore_*pct`: of the 1024 points at a percentage of the

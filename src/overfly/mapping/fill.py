@@ -11,7 +11,7 @@ FILL = 8
 """Cells that a colour is carried on, each from surely seen cells and from any."""
 
 FILLED = 254
-"""Alpha of such cells: opaque to the eye, and yet told from photographed ones (255) and from empty ones (0)."""
+"""Alpha of cells that no photograph sees: opaque to the eye, yet told from photographed (255) and empty ones (0)."""
 
 SURE = 0.02
 """Worth up to which a frame may well show the edge of what hides the cell instead of the cell."""

@@ -25,8 +25,9 @@ SURE_THOUGH_SEEN, SURER = 0.7, 0.1
 matched, and what is added for each further one: against four it never stands."""
 
 AGREED, AGREED_UNSEEN = 0.8, 0.6
-"""Confidence from which on a network's word stands that another frame agrees with: the first where further frames have
-the place inside and say something else, which is what waves and shadows do, the second where none has."""
+"""Confidence from which on a depth stands that began with a network's word and that another frame agrees with: the
+first where further frames have the place inside and say something else, as on waves and in shadows, the second where
+none has. It is the network's own, or, of a word that was moved to where images correlate, that of matched points."""
 
 NEAR, AWAY = 4, 30
 """Voxels along a cell of the plan in which one matched point makes a guess needless: the first if other frames agree
@@ -123,7 +124,9 @@ def frame_points(
     apart = np.where(second, np.where(near, NEAR, AWAY), 0).astype(np.uint8)
     image, shown = _shown(frame, own)
     known = (known | alone) & shown
-    fresh = known & ~seen.taken & ~doubted  # which counts as given: another frame's word on it is no better
+    # What is doubted counts as given: else Brighton gets twice the false points, from frames that agree by chance, too.
+    # The price: a later frame that is surer of the place is not asked.
+    fresh = known & ~seen.taken & ~doubted
     merged = seen.depth[fresh]
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)

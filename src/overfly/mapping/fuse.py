@@ -64,7 +64,7 @@ def fuse(
     Returns:
         Tiles in ``workdir/tiles``: points with colour; ``views``, the frames that measured them (2 or more; 1 if
         predicted); ``sigma_m``, their standard deviation along the ray; ``confidence``, the share of such points that
-        was found right; ``predicted``, the word of a network alone, kept where nothing was matched.
+        was found right; ``predicted``, the word of a network alone, kept where nothing was matched near.
 
     Raises:
         InputError: the maps hold no depth at all.
@@ -163,7 +163,7 @@ class _Fusion:
         return self.workdir / f"given-{k:05d}.npz"
 
     def _given(self, k: int) -> NDArray[np.bool_]:
-        """The pixels [H, W] of a frame that are in the cloud by it or by frames before it."""
+        """The pixels [H, W] of a frame that later ones need not give: in the cloud already, or doubted."""
         try:
             kept = load_arrays(self._mask(k))
         except Damaged:

@@ -38,9 +38,6 @@ REACH = 6
 HOLE = 24
 """The same for a hole with known cells all around: beyond that it may be a lake, or ground that nobody flew over."""
 
-SMOOTH = 3
-"""Passes by which GDAL smooths what it has interpolated."""
-
 
 def close_gaps(heights: Any, sources: Any, grid: Grid, cells: int) -> dict[str, float]:
     """Fill the empty cells between known ones in an open raster of heights, and mark them in another.
@@ -56,7 +53,7 @@ def close_gaps(heights: Any, sources: Any, grid: Grid, cells: int) -> dict[str, 
     """
     coarse = _overview(heights, grid)
     between = _between(np.isfinite(coarse))
-    smooth = _interpolated(coarse)
+    smooth = _interpolated(coarse, between)
     counts = np.zeros(len(SOURCES) + 1, np.int64)
     for window in windows(grid, cells):
         z = heights.read(1, window=window.place)
@@ -88,13 +85,12 @@ def _overview(heights: Any, grid: Grid) -> NDArray[np.float32]:
 
 
 def _between(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells of the overview that known ones enclose or nearly so."""
-    from scipy.ndimage import binary_fill_holes, distance_transform_edt, label, maximum
+    """Cells of the overview that known ones enclose or nearly so; without the outermost ones, known in part."""
+    from scipy.ndimage import binary_erosion, binary_fill_holes, distance_transform_edt, label, maximum
 
     padded = np.pad(known, REACH + 1)
     grown = distance_transform_edt(~padded) <= REACH
-    closed = distance_transform_edt(grown) > REACH
-    closed |= padded
+    closed = (distance_transform_edt(grown) > REACH) | padded
     holes = binary_fill_holes(closed) & ~closed
     numbers, count = label(holes)
     if count:
@@ -103,30 +99,70 @@ def _between(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
         small[0] = False
         closed |= small[numbers]
     inner = slice(REACH + 1, -REACH - 1)
-    return np.asarray(closed[inner, inner])
+    return np.asarray(binary_erosion(closed, np.ones((3, 3), bool))[inner, inner])
 
 
-def _interpolated(coarse: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The overview with a height in every cell: weighted by the inverse distance to known ones."""
-    from rasterio.fill import fillnodata
+def _interpolated(coarse: NDArray[np.float32], between: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The overview with the heights of a membrane that hangs between known cells; NaN where nothing holds it.
+
+    Laplace's equation with free ends where a bay is open: a plane is carried on as a plane, and no height lies beyond
+    those around it.
+    """
+    from scipy.ndimage import binary_dilation
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import spsolve
 
     known = np.isfinite(coarse)
-    full = fillnodata(
-        np.where(known, coarse, 0).astype(np.float32),
-        mask=known.astype(np.uint8),
-        max_search_distance=float(2 * HOLE),
-        smoothing_iterations=SMOOTH,
+    # One cell more all around, so that heights between the middles of cells are there, too.
+    asked = binary_dilation(between, np.ones((3, 3), bool)) & ~known
+    asked &= _held(asked, known)
+    full = coarse.copy()
+    if not asked.any():
+        return full
+    number = np.cumsum(asked.ravel()).reshape(asked.shape) - 1
+    count = int(asked.sum())
+    ends, values, degree = [], np.zeros(count), np.zeros(count)
+    later, earlier = slice(1, None), slice(None, -1)
+    for axis in (0, 1):
+        for one, other in ((later, earlier), (earlier, later)):
+            at = tuple(one if k == axis else slice(None) for k in (0, 1))
+            by = tuple(other if k == axis else slice(None) for k in (0, 1))
+            fixed = asked[at] & known[by]
+            free = asked[at] & asked[by]
+            np.add.at(values, number[at][fixed], coarse[by][fixed].astype(np.float64))
+            np.add.at(degree, number[at][fixed | free], 1.0)
+            ends.append(np.stack([number[at][free], number[by][free]]))
+    row, column = np.concatenate(ends, axis=1)
+    own = np.arange(count)
+    matrix = csc_array(
+        (np.concatenate([-np.ones(len(row)), degree]), (np.concatenate([row, own]), np.concatenate([column, own]))),
+        shape=(count, count),
     )
-    return np.where(known, coarse, full).astype(np.float32)
+    full[asked] = spsolve(matrix, values)
+    return full
+
+
+def _held(asked: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which asked cells hang together, side by side, with a known one."""
+    from scipy.ndimage import binary_dilation, label
+
+    numbers, count = label(asked)
+    touched = np.zeros(count + 1, bool)
+    touched[numbers[binary_dilation(known) & asked]] = True
+    touched[0] = False
+    return np.asarray(touched[numbers])
 
 
 def _on_cells(coarse: NDArray[np.float32], window: Window) -> NDArray[np.float32]:
     """A layer of the overview at the cells of a window, bilinear."""
     import cv2
 
-    row, column = (
-        ((np.arange(part.start, part.stop, dtype=np.float32) + 0.5) / COARSE - 0.5)
-        for part in (window.rows, window.columns)
-    )
-    x, y = np.meshgrid(column, row)
-    return np.asarray(cv2.remap(coarse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    places, parts = [], []
+    for part, size in zip((window.rows, window.columns), coarse.shape, strict=True):
+        first = max(part.start // COARSE - 1, 0)
+        parts.append(slice(first, min(-(-part.stop // COARSE) + 1, size)))  # OpenCV takes no side of 32,767 and more
+        at = (np.arange(part.start, part.stop) + 0.5) / COARSE - 0.5
+        places.append((np.clip(at, 0, size - 1) - first).astype(np.float32))
+    x, y = np.meshgrid(places[1], places[0])
+    piece = np.ascontiguousarray(coarse[parts[0], parts[1]])
+    return np.asarray(cv2.remap(piece, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

@@ -42,6 +42,9 @@ RAMP = 4
 AMID = 3
 """Cells around doubtful ones that are as doubtful: single ones that were measured in a wood, deep between crowns."""
 
+WIDE = 3
+"""Cells that a doubtful place must measure each way: pinholes of measured ground are no wood."""
+
 NADIR = 0.5
 """Tangent off the vertical at which a frame is worth half of one that looks straight down."""
 
@@ -150,7 +153,9 @@ class Orthophoto:
         filled = fill(rgb, worth, fine, np.float32(STEP * surface.cell))
         if doubtful is not None and doubtful.any():
             unsure = on_finer(_grown(doubtful), surface, wide) >= 0.5
-            filled |= self._through(wide.cell, fine, here, rgb, unsure & (worth == 0) & ~filled & np.isfinite(fine))
+            left = np.zeros_like(filled)
+            left[inner] = (unsure & (worth == 0) & ~filled & np.isfinite(fine))[inner]
+            filled |= self._through(wide.cell, fine, here, rgb, left)
         alpha = np.where(worth > 0, 255, np.where(filled, FILLED, 0)).astype(np.uint8)
         return np.ascontiguousarray(np.moveaxis(rgb, 0, -1)[inner]), alpha[inner].copy()
 
@@ -205,8 +210,8 @@ class Orthophoto:
         import cv2
 
         best = np.zeros(left.shape, np.float32)
-        for i, parts in here.items():
-            sight = self._sights[i]
+        for i in sorted(here, reverse=True):  # the last images drawn are still at hand
+            sight, parts = self._sights[i], here[i]
             for part in parts:
                 at = part.rows, part.columns
                 if not left[at].any():
@@ -247,9 +252,11 @@ class Orthophoto:
 
 
 def _grown(cells: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Doubtful cells without pinholes and lines, and what lies amid or beside them."""
     import cv2
 
-    return np.asarray(cv2.dilate(cells.astype(np.uint8), np.ones((2 * AMID + 1, 2 * AMID + 1), np.uint8)))
+    wide = cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_OPEN, np.ones((WIDE, WIDE), np.uint8))
+    return np.asarray(cv2.dilate(wide, np.ones((2 * AMID + 1, 2 * AMID + 1), np.uint8)))
 
 
 def _value(x: Map, y: Map, depth: Map, slope: Map, camera: Camera, cell: float) -> Map:

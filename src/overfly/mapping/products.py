@@ -18,7 +18,7 @@ from overfly.cloud import Cloud, concatenate
 from overfly.errors import InputError
 from overfly.files import replacing
 from overfly.geodesy import crs_code
-from overfly.mapping.gaps import INTERPOLATED, MEASURED, NODATA, PALETTE, PREDICTED, close_gaps
+from overfly.mapping.gaps import COARSE, INTERPOLATED, MEASURED, NODATA, PALETTE, PREDICTED, close_gaps
 from overfly.mapping.raster import Grid, grid_over, surface
 from overfly.mapping.tiles import Tiles
 from overfly.mapping.windows import window_over, windows
@@ -37,9 +37,6 @@ SAMPLE = 2_000_000
 
 GDAL_CACHE = 64 * 2**20
 """Bytes that GDAL may hold: by itself it takes a twentieth of the machine."""
-
-OVERVIEW = 8
-"""Cells of the surface model along a cell of the overview that a painter is made from."""
 
 
 class Painter(Protocol):
@@ -180,13 +177,13 @@ def _paint(
     heights: Any, sources: Any, grid: Grid, make: PainterMaker, cell: float, path: Path, crs: str | None, cells: int
 ) -> None:
     """Write the orthophoto in the colours of a painter, from the surface model that was written before."""
-    known = OVERVIEW * grid.cell
-    rows, columns = -(-grid.rows // OVERVIEW), -(-grid.columns // OVERVIEW)
+    known = COARSE * grid.cell
+    rows, columns = -(-grid.rows // COARSE), -(-grid.columns // COARSE)
     coarse = np.full((rows, columns), np.nan, np.float32)
     for row in range(rows):  # the middle of each cell; one row in memory, whatever the size of the map
-        at = min(row * OVERVIEW + OVERVIEW // 2, grid.rows - 1)
+        at = min(row * COARSE + COARSE // 2, grid.rows - 1)
         line = heights.read(1, window=((at, at + 1), (0, grid.columns)))[0]
-        picked = line[np.minimum(np.arange(columns) * OVERVIEW + OVERVIEW // 2, grid.columns - 1)]
+        picked = line[np.minimum(np.arange(columns) * COARSE + COARSE // 2, grid.columns - 1)]
         coarse[row] = np.where(picked == NODATA, np.nan, picked)
     painter = make(Grid(grid.x_min, grid.y_max, known, rows, columns), coarse)
     x_min, x_max, y_min, y_max = grid.extent

@@ -139,8 +139,10 @@ def surface(cloud: Cloud, grid: Grid, *, fill: int = 0) -> Surface:
     if cloud.colors is not None:
         layers |= {name: mean(cloud.colors[:, channel]) for channel, name in enumerate("rgb")}
     stack = np.stack(list(layers.values()), axis=-1)
+    counts = counts.reshape(grid.rows, grid.columns)
     if fill:
-        stack[_speckles(layers["heights"], LAYER * grid.cell)] = np.nan
+        lone = _speckles(layers["heights"], LAYER * grid.cell)
+        stack[lone], counts[lone] = np.nan, 0
     closed = _fill(stack, fill)
     made = dict(zip(layers, np.moveaxis(closed, -1, 0), strict=True))
     colors = None
@@ -150,7 +152,7 @@ def surface(cloud: Cloud, grid: Grid, *, fill: int = 0) -> Surface:
         grid,
         made["heights"],
         colors,
-        counts.reshape(grid.rows, grid.columns),
+        counts,
         made.get("views"),
         made.get("predicted"),
     )
