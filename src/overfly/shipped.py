@@ -5,7 +5,6 @@ They lie in ``overfly/weights`` as ``NAME.safetensors`` and ``NAME.json``; ``ove
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from overfly.errors import InputError
 from overfly.files import replacing
 from overfly.run import Run, load_run
 from overfly.run_folder import WEIGHTS, checkpoint
+from overfly.tables import read_rows
 
 DEFAULT = "base"
 """The network that maps are made with if none is named."""
@@ -100,10 +100,5 @@ def _scores(weights: Path) -> dict[str, float]:
     import torch
 
     epoch = torch.load(weights, map_location="cpu", weights_only=True).get("epoch")
-    table = weights.parent.parent / "metrics.csv"
-    if epoch is None or not table.is_file():
-        return {}
-    with table.open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if float(row["epoch"]) == epoch]
-    values = rows[-1].items() if rows else []
-    return {key: round(float(value), 6) for key, value in values if key.startswith("val/") and value}
+    rows = [row for row in read_rows(weights.parent.parent / "metrics.csv") if row["epoch"] == epoch]
+    return {key: round(value, 6) for key, value in (rows[-1] if rows else {}).items() if key.startswith("val/")}

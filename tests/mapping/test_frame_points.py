@@ -20,6 +20,22 @@ from overfly.mapping.frame_points import AWAY, NEAR, cleaned, frame_points
 from overfly.mapping.thinning import BLOCK, thinned_tile
 
 
+def word(
+    camera: Camera, folder: Path, sure: float, once: bool | NDArray[np.bool_]
+) -> tuple[DepthMap, Frame, dict[str, NDArray[Any]]]:
+    """A frame of which a network alone has spoken: 50 m everywhere, so sure; where no other frame sees the place."""
+    shape = camera.height, camera.width
+    data = {
+        "depth": np.full(shape, 50, np.float32), "sigma": np.full(shape, 0.1, np.float32),
+        "support": np.zeros(shape, np.uint8), "score": np.full(shape, -1, np.float32),
+        "paired": np.zeros(shape, bool), "guessed": np.ones(shape, bool), "second": np.ones(shape, bool),
+        "sure": np.full(shape, sure, np.float32), "once": np.broadcast_to(once, shape),
+    }  # fmt: skip
+    frame = Frame("a", folder / "a.png", camera.width, camera.height, camera=camera)
+    Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
+    return DepthMap("a", camera, np.eye(4), [], folder / "a.npz"), frame, data
+
+
 @pytest.mark.parametrize(
     ("others", "sure", "share"), [(1, 0.5, 0.5), (1, 0.75, 1.0), (2, 0.75, 0.5), (2, 0.85, 1.0), (4, 0.99, 0.5)]
 )
@@ -27,23 +43,13 @@ def test_a_word_alone_must_be_surer_the_more_other_frames_see_the_place(
     camera: Camera, others: int, sure: float, share: float, tmp_path: Path
 ) -> None:
     """What other frames have inside and could not match is mostly wood and water, where networks err, too."""
-    shape = camera.height, camera.width
-    once = np.zeros(shape, bool)
-    once[:, : camera.width // 2] = True
-    data = {
-        "depth": np.full(shape, 50, np.float32), "sigma": np.ones(shape, np.float32),
-        "support": np.zeros(shape, np.uint8), "score": np.full(shape, -1, np.float32),
-        "paired": np.zeros(shape, bool), "guessed": np.ones(shape, bool),
-        "second": np.ones(shape, bool), "sure": np.full(shape, sure, np.float32), "once": once,
-    }  # fmt: skip
-    own = DepthMap("a", camera, np.eye(4), [], tmp_path / "a.npz")
-    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
-    Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
-    silent = data | {"depth": np.full(shape, np.nan, np.float32)}
+    once = np.arange(camera.width) < camera.width // 2
+    own, frame, data = word(camera, tmp_path, sure, once)
+    silent = data | {"depth": np.full_like(data["depth"], np.nan)}
     cloud, *_ = frame_points(own, data, [(own, silent, None)] * others, frame, single=True)
     assert cloud.predicted is not None
     assert cloud.predicted.all()
-    assert len(cloud) == pytest.approx(share * once.size, abs=camera.height)
+    assert len(cloud) == pytest.approx(share * camera.width * camera.height, abs=camera.height)
 
 
 @pytest.mark.parametrize(
@@ -53,17 +59,8 @@ def test_a_word_that_another_frame_agrees_with_must_be_surer_where_a_further_one
     camera: Camera, further: int, sure: float, kept: bool, tmp_path: Path
 ) -> None:
     """Two frames agree by chance on waves and shadows, three do not."""
-    shape = camera.height, camera.width
-    data = {
-        "depth": np.full(shape, 50, np.float32), "sigma": np.full(shape, 0.1, np.float32),
-        "support": np.zeros(shape, np.uint8), "score": np.full(shape, -1, np.float32),
-        "paired": np.zeros(shape, bool), "guessed": np.ones(shape, bool),
-        "second": np.ones(shape, bool), "sure": np.full(shape, sure, np.float32), "once": np.zeros(shape, bool),
-    }  # fmt: skip
-    own = DepthMap("a", camera, np.eye(4), [], tmp_path / "a.npz")
-    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
-    Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
-    silent = data | {"depth": np.full(shape, np.nan, np.float32)}
+    own, frame, data = word(camera, tmp_path, sure, False)
+    silent = data | {"depth": np.full_like(data["depth"], np.nan)}
     partners = [(own, data, None), *[(own, silent, None)] * further]
     cloud, apart, given, _ = frame_points(own, data, partners, frame, single=True)
     assert len(cloud) == (camera.width * camera.height if kept else 0)
@@ -75,16 +72,7 @@ def test_a_word_that_another_frame_agrees_with_must_be_surer_where_a_further_one
 def test_only_what_is_carried_on_surely_stands_beside_measured_points(
     camera: Camera, sure: float, once: bool, apart: int, tmp_path: Path
 ) -> None:
-    shape = camera.height, camera.width
-    data = {
-        "depth": np.full(shape, 50, np.float32), "sigma": np.ones(shape, np.float32),
-        "support": np.zeros(shape, np.uint8), "score": np.full(shape, -1, np.float32),
-        "paired": np.zeros(shape, bool), "guessed": np.ones(shape, bool),
-        "second": np.ones(shape, bool), "sure": np.full(shape, sure, np.float32), "once": np.full(shape, once),
-    }  # fmt: skip
-    own = DepthMap("a", camera, np.eye(4), [], tmp_path / "a.npz")
-    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
-    Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
+    own, frame, data = word(camera, tmp_path, sure, once)
     cloud, cells, *_ = frame_points(own, data, [], frame, single=True)
     assert len(cloud) == camera.width * camera.height
     assert (cells == apart).all()

@@ -20,33 +20,22 @@ from overfly.errors import InputError
 from overfly.geodesy import Origin
 from overfly.geometry import Camera
 from overfly.mapping.blend import BLOCK, Canvas
-from overfly.mapping.fill import FILLED, SURE, fill
+from overfly.mapping.fill import FILLED, fill
 from overfly.mapping.gains import balance
 from overfly.mapping.lattice import STEP, Chunk, Map, anchor, chunks, on_finer, placing
 from overfly.mapping.raster import Grid
 from overfly.mapping.sight import DepthBuffer, Sight, walls
 from overfly.mapping.visibility import Image, View
+from overfly.mapping.worth import EDGE, feathered, value_of
 
 MARGIN = 6
 """Blocks computed around a window: one for filling, two each for the tone and for the votes, one for masks' filters."""
-
-HEM, SOFT = 9, 5
-"""Kernels, in cells, by which a frame's mask shrinks from what is hidden from it, and is then smoothed."""
-
-EDGE = 8
-"""Cells around a frame's box in which the filters of its mask may look."""
-
-RAMP = 4
-"""A frame has its full weight from 1 / RAMP of the image's side from the border on."""
 
 AMID = 3
 """Cells around doubtful ones that are as doubtful: single ones that were measured in a wood, deep between crowns."""
 
 WIDE = 3
 """Cells that a doubtful place must measure each way: pinholes of measured ground are no wood."""
-
-NADIR = 0.5
-"""Tangent off the vertical at which a frame is worth half of one that looks straight down."""
 
 
 class Orthophoto:
@@ -173,7 +162,7 @@ class Orthophoto:
         for part in parts:
             u, v, depth, slope = sight.ideal(part, part.x[None, :], part.y[:, None], fine[part.rows, part.columns])
             x, y = sight.pixels(u, v, camera)
-            value = _value(x, y, depth, slope, camera, cell)
+            value = value_of(x, y, depth, slope, camera, cell)
             if not value.any():
                 continue
             here = (
@@ -182,7 +171,7 @@ class Orthophoto:
             )
             free[here][depths.hides(u, v, depth)] = 0
             looks.append((part, here, x - np.float32(0.5), y - np.float32(0.5), value))
-        soft = _feathered(free) * np.float32(np.clip(self.gains.sharpness[i], 0.1, 1))
+        soft = feathered(free) * np.float32(np.clip(self.gains.sharpness[i], 0.1, 1))
         canvas.begin()
         for part, here, x, y, value in looks:
             worth = value * soft[here]
@@ -219,7 +208,7 @@ class Orthophoto:
                 image, camera = self._image(i, cell)
                 u, v, depth, slope = sight.ideal(part, part.x[None, :], part.y[:, None], fine[at])
                 x, y = sight.pixels(u, v, camera)
-                value = _value(x, y, depth, slope, camera, cell)
+                value = value_of(x, y, depth, slope, camera, cell)
                 better = left[at] & (value > best[at])
                 if better.any():
                     half = np.float32(0.5)
@@ -259,26 +248,6 @@ def _grown(cells: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return np.asarray(cv2.dilate(wide, np.ones((2 * AMID + 1, 2 * AMID + 1), np.uint8)))
 
 
-def _value(x: Map, y: Map, depth: Map, slope: Map, camera: Camera, cell: float) -> Map:
-    """What a frame is worth for each cell, if nothing hides it: 0 outside the image.
-
-    Args:
-        x, y: pixels of the cells.
-        depth: along the optical axis.
-        slope: squared tangent off the vertical.
-        camera: of the image as it is drawn.
-        cell: side of the cells.
-    """
-    with np.errstate(invalid="ignore"):
-        edge = np.minimum(
-            np.minimum(x, camera.width - x) / np.float32(camera.width),
-            np.minimum(y, camera.height - y) / np.float32(camera.height),
-        )
-        fineness = np.minimum(1, np.float32(cell * camera.fx) / depth)
-        value = np.clip(RAMP * edge, 0, 1) * fineness / (1 + slope / np.float32(NADIR**2))
-        return np.where(value > 0, value, np.float32(0))
-
-
 def _widened(grid: Grid) -> tuple[Grid, tuple[slice, slice]]:
     """The grid grown to whole blocks, counted from zero, and :data:`MARGIN` more each way; and where the grid lies."""
     left, rest_x = anchor(grid.x_min, grid.cell)
@@ -288,17 +257,3 @@ def _widened(grid: Grid) -> tuple[Grid, tuple[slice, slice]]:
     rows = (-(-(top + grid.rows) // BLOCK) + MARGIN) * BLOCK - first
     wide = Grid(begin * grid.cell + rest_x, -(first * grid.cell) - rest_y, grid.cell, rows, columns)
     return wide, (slice(top - first, top - first + grid.rows), slice(left - begin, left - begin + grid.columns))
-
-
-def _feathered(free: NDArray[np.uint8]) -> Map:
-    """Factors 0..1 from a mask of 255 where nothing hides the cells: 0 where hidden, and little beside that.
-
-    The cells beside are the edges of roofs, of which this frame may be the only one to see anything.
-    """
-    import cv2
-
-    # Beyond the box lies what the image does not show: free in any window.
-    padded = cv2.medianBlur(np.pad(free, EDGE, constant_values=255), 5)
-    soft = cv2.blur(cv2.erode(padded, np.ones((HEM, HEM), np.uint8)), (SOFT, SOFT))
-    factor = np.where(padded > 0, np.maximum(soft, int(255 * SURE)), 0) / np.float32(255)
-    return np.asarray(factor[EDGE:-EDGE, EDGE:-EDGE])
