@@ -53,7 +53,7 @@ def test_a_word_alone_must_be_surer_the_more_other_frames_see_the_place(
 
 
 @pytest.mark.parametrize(
-    ("further", "sure", "kept"), [(0, 0.55, False), (0, 0.65, True), (1, 0.65, False), (1, 0.85, True)]
+    ("further", "sure", "kept"), [(0, 0.55, False), (0, 0.65, True), (1, 0.65, False), (1, 0.85, True), (1, 0.95, True)]
 )
 def test_a_word_that_another_frame_agrees_with_must_be_surer_where_a_further_one_does_not(
     camera: Camera, further: int, sure: float, kept: bool, tmp_path: Path
@@ -64,7 +64,7 @@ def test_a_word_that_another_frame_agrees_with_must_be_surer_where_a_further_one
     partners = [(own, data, None), *[(own, silent, None)] * further]
     cloud, apart, given, _ = frame_points(own, data, partners, frame, single=True)
     assert len(cloud) == (camera.width * camera.height if kept else 0)
-    assert (apart == NEAR).all()
+    assert (apart == (AWAY if further and sure < 0.9 else NEAR)).all()
     assert given.all()  # no later frame is asked about what this one doubts
 
 
@@ -206,3 +206,57 @@ def test_a_guess_stands_as_far_from_matched_points_as_it_must() -> None:
     found = thinned_tile(matched, guesses, apart, 1.0, np.zeros(2, int), np.full(2, BLOCK)).points[len(matched) :]
     assert found[found[:, 1] == 0.5, 0].min() == NEAR + 0.5
     assert found[found[:, 1] == 1.5, 0].min() == AWAY + 0.5
+
+
+def spoken(
+    camera: Camera, folder: Path, depth: NDArray[Any], support: int, said: NDArray[Any], sure: float
+) -> DepthMap:
+    """A map of which pairs have matched ``depth``, and of which a network says ``said``, give or take 1 m."""
+    shape = camera.height, camera.width
+    small = shape[0] // 2, shape[1] // 2
+    answer = {
+        "depth": said, "alone": said, "sigma": np.ones(small), "confidence": np.full(small, sure),
+        "views": np.full(small, 2, np.uint8),
+    }  # fmt: skip
+    path = folder / "depth.npz"
+    save_arrays(path, {
+        "depth": depth.astype(np.float32), "sigma": np.full(shape, 0.1, np.float16),
+        "support": np.where(np.isfinite(depth), support, 0).astype(np.uint8), "score": np.full(shape, 90, np.int8),
+        "paired": np.isfinite(depth), **{f"opinion_{name}": values.astype(np.uint8 if name == "views" else np.float32)
+        for name, values in answer.items()},
+    })  # fmt: skip
+    return DepthMap("a", camera, np.eye(4), [], path)
+
+
+@pytest.mark.parametrize(
+    ("support", "off", "sure", "stands"),
+    [(1, 3.9, 0.5, True), (1, 4.1, 0.5, False), (1, 6.9, 0.9, True), (1, 7.1, 0.9, False), (2, 20, 0.5, True)],
+)
+def test_what_one_pair_alone_has_matched_must_not_contradict_the_network(
+    camera: Camera, support: int, off: float, sure: float, stands: bool, tmp_path: Path
+) -> None:
+    """Where the network is not sure images match badly: there the pair is doubted sooner. Two pairs overrule it."""
+    depth = np.full((camera.height, camera.width), 50.0)
+    said = np.full((camera.height // 2, camera.width // 2), 50.0 + off)
+    data = cleaned(spoken(camera, tmp_path, depth, support, said, sure))
+    assert (data["depth"] == (50 if stands else np.float32(50 + off))).all()
+    assert (data["guessed"] != stands).all()
+    assert (data["support"] == (support if stands else 0)).all()
+    assert not data["second"][~data["guessed"]].any()
+
+
+def test_a_networks_word_follows_the_measured_depths_around_it(camera: Camera, tmp_path: Path) -> None:
+    """It is 2 m off on one side, as its neighbours tell; on the other they are of another surface, or far away."""
+    depth = np.full((camera.height, camera.width), 50.0)
+    hole, half = 12, camera.width // 2
+    depth[:, half:] = 44
+    depth[camera.height // 2 - 5 : camera.height // 2 + 5, 40 : 40 + hole] = np.nan
+    depth[camera.height // 2 - 5 : camera.height // 2 + 5, half + 40 : half + 40 + hole] = np.nan
+    depth[-60:, :] = np.nan
+    said = np.full((camera.height // 2, camera.width // 2), 52.0)
+    data = cleaned(spoken(camera, tmp_path, depth, 2, said, 0.9))
+    row = camera.height // 2
+    assert data["guessed"][row, 46]
+    assert data["depth"][row, 46] == pytest.approx(50, abs=0.5)
+    assert data["depth"][row, half + 46] == pytest.approx(52)
+    assert data["depth"][-1, 46] == pytest.approx(52, abs=0.01)

@@ -34,6 +34,17 @@ class Opinion:
     views: NDArray[np.uint8]
     alone: Map
 
+    def resized(self, width: int, height: int) -> Opinion:
+        """The same maps [height, width]."""
+        import cv2
+
+        parts = {
+            name: cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR)
+            for name, part in vars(self).items()
+            if name != "views"
+        }
+        return Opinion(**parts, views=cv2.resize(self.views, (width, height), interpolation=cv2.INTER_NEAREST))
+
     def settled(self, measured: Map, camera: Camera, world_from_camera: Array) -> Opinion:
         """The opinion after the frame was measured: places seen once follow the measured ones around them.
 
