@@ -68,11 +68,13 @@ def test_a_word_that_another_frame_agrees_with_must_be_surer_where_a_further_one
     assert given.all()  # no later frame is asked about what this one doubts
 
 
-@pytest.mark.parametrize(("sure", "once", "apart"), [(0.65, True, NEAR), (0.5, True, AWAY), (0.75, False, AWAY)])
-def test_only_what_is_carried_on_surely_stands_beside_measured_points(
-    camera: Camera, sure: float, once: bool, apart: int, tmp_path: Path
+@pytest.mark.parametrize(("pixels", "once", "apart"), [(6.9, True, NEAR), (7.1, True, AWAY), (1, False, AWAY)])
+def test_only_what_is_carried_on_exactly_stands_beside_measured_points(
+    camera: Camera, pixels: float, once: bool, apart: int, tmp_path: Path
 ) -> None:
-    own, frame, data = word(camera, tmp_path, sure, once)
+    """``pixels``: standard deviation on the ground."""
+    own, frame, data = word(camera, tmp_path, 0.75, once)
+    data["sigma"][:] = pixels * 50 / camera.fx
     cloud, cells, *_ = frame_points(own, data, [], frame, single=True)
     assert len(cloud) == camera.width * camera.height
     assert (cells == apart).all()
@@ -230,12 +232,15 @@ def spoken(
 
 @pytest.mark.parametrize(
     ("support", "off", "sure", "stands"),
-    [(1, 3.9, 0.5, True), (1, 4.1, 0.5, False), (1, 6.9, 0.9, True), (1, 7.1, 0.9, False), (2, 20, 0.5, True)],
-)
-def test_what_one_pair_alone_has_matched_must_not_contradict_the_network(
+    [
+        (1, 3.5, 0.5, True), (1, 3.7, 0.5, False), (1, 6.7, 0.9, True), (1, 7, 0.9, False),
+        (2, 5.2, 0.5, True), (2, 5.5, 0.5, False), (2, 10, 0.9, True), (2, 10.5, 0.9, False),
+    ],
+)  # fmt: skip
+def test_what_was_matched_must_not_contradict_the_network(
     camera: Camera, support: int, off: float, sure: float, stands: bool, tmp_path: Path
 ) -> None:
-    """Where the network is not sure images match badly: there the pair is doubted sooner. Two pairs overrule it."""
+    """Where the network is not sure images match badly: there pairs are doubted sooner, one alone most."""
     depth = np.full((camera.height, camera.width), 50.0)
     said = np.full((camera.height // 2, camera.width // 2), 50.0 + off)
     data = cleaned(spoken(camera, tmp_path, depth, support, said, sure))

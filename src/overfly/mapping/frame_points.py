@@ -33,15 +33,15 @@ NEAR, AWAY = 4, 30
 """Voxels along a cell of the plan in which one matched point makes a guess needless: the first if it is
 sure or frames agree, as the next constants say, the second else."""
 
-SURE_NEAR, AGREED_NEAR = 0.6, 0.9
-"""Confidence from which on a guess may stand close to matched points: the first if one frame alone sees the place, the
-second if two agree and a third says something else. What two agree on that alone see it always may."""
+SURE_NEAR, AGREED_NEAR = 7.0, 0.9
+"""What lets a guess stand close to matched points: if one frame alone sees the place, the largest standard deviation,
+ground pixels; if two agree and a third says something else, the confidence. What two agree on that alone see it may."""
 
-CONTRADICTED = 2.0, 8.0
-"""What one pair alone has matched is dropped if it is so many of the network's standard deviations off its word: the
-first where the network is not sure at all, since images match badly there, the second where it is quite sure and may
-only have rounded a wall off; between them in even ratios. On eight flights up to half of what is dropped was right to
-1 m, mostly less than a fifth; of all that one pair alone has matched 75 to 95 %."""
+CONTRADICTED, BY_PAIRS = (1.6, 8.0), 1.5
+"""What was matched is dropped if it is so many of the network's standard deviations off its word: the first where the
+network is not sure at all, since images match badly there, the second where it is quite sure and may only have rounded
+a wall off; between them in even ratios; and so many times that if several pairs agree. On eight flights up to half of
+what is dropped was right to 1 m, mostly less than a fifth; of all that one pair alone has matched 75 to 95 %."""
 
 SAME_SURFACE, BESIDE, FAINT = 3.0, 2.0, 0.05
 """A network's word is moved by what it misses measured depths by around: those that are so many of its standard
@@ -67,7 +67,7 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     if word is not None:
         limit = word.sigma * CONTRADICTED[0] * (CONTRADICTED[1] / CONTRADICTED[0]) ** word.confidence
         with np.errstate(invalid="ignore"):
-            known &= (data["support"] >= 2) | ~(np.abs(word.depth - depth) > limit)
+            known &= ~(np.abs(word.depth - depth) > np.where(data["support"] < 2, 1, BY_PAIRS) * limit)
     # Speckle is judged in steps of sigma along the inverse depth, where a slope is smooth.
     middle = float(np.median(depth[known])) if known.any() else 1.0
     unit = float(np.median((data["sigma"] / depth**2)[known])) if known.any() else 1.0
@@ -153,9 +153,8 @@ def frame_points(
     own_word = data["sure"] if "sure" in data else np.float32(0)
     confidence = np.where(guessed, own_word, _confidence(votes, agree, data["score"])).astype(np.float32)
     doubted = second & ~alone & (confidence < np.where(silent > 0, AGREED, AGREED_UNSEEN))
-    near = np.where(
-        alone, data.get("once", False) & (confidence >= SURE_NEAR), (silent == 0) | (confidence >= AGREED_NEAR)
-    )
+    exact = seen.sigma * own.camera.fx <= SURE_NEAR * depth
+    near = np.where(alone, data.get("once", False) & exact, (silent == 0) | (confidence >= AGREED_NEAR))
     apart = np.where(second, np.where(near, NEAR, AWAY), 0).astype(np.uint8)
     image, shown = _shown(frame, own)
     known = (known | alone) & shown
