@@ -62,7 +62,7 @@ def compared(
     for partner, other, before in partners:
         found, spread, given, theirs, inside = _look_up(own, depth, partner, other, before)
         visible += inside
-        # What pairs have matched is judged by what pairs have matched alone: the cloud of them is that of stereo.
+        # What pairs have matched is judged by what pairs have matched alone, as if no network had spoken.
         found = np.where(theirs & ~second, np.float32(np.nan), found)
         with np.errstate(invalid="ignore"):
             gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
