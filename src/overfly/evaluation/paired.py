@@ -11,34 +11,33 @@ from torch import Tensor
 
 from overfly.evaluation.answers import Answer, on_grid
 from overfly.evaluation.semi_global import one_window, pair_depth, rise, shots
-from overfly.mapping.frame_points import WORST_SCORE
+from overfly.mapping.frame_points import WORST_SCORE, contradicted
 from overfly.mapping.subpixel import refine
 
 PAIR_STEPS, NETWORK_STEPS = (-1, -0.5, 0, 0.5, 1), (-2, -1, 0, 1, 2)
 """Pixels around each depth that are tried; the network may be off by more than a pair."""
 
-GATE = 3.0
-"""Sigmas of the network within which the word of one pair alone stands."""
-
 
 def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
     """The answer of a network that tells a surface with sigma, corrected by pairs and by correlation.
 
-    As :mod:`overfly.mapping.stereo` does, but that there the network never overrules a pair: other frames' maps do.
-    Where pairs have matched and all frames correlate there, their refined depth stands, if two pairs agree or it lies
-    within :data:`GATE` of the network's sigma; else the network's does, refined where it correlates. Sigma and
-    confidence stay those of the network.
+    As :mod:`overfly.mapping.stereo` and :func:`overfly.mapping.frame_points.cleaned` do: where pairs have matched and
+    all frames correlate there, their refined depth stands unless the network contradicts it; else the network's does,
+    refined where it correlates. Sigma and confidence stay those of the network.
 
     Args:
         answer: of the network.
         batch: the windows.
     """
     assert answer.sigma is not None
+    assert answer.confidence is not None
     heights = []
     for number in range(len(answer.height)):
         window = one_window(batch, number)
         frames = shots(window)
-        said, sigma = (maps[number].double().cpu().numpy() for maps in (answer.height, answer.sigma))
+        said, sigma, sure = (
+            maps[number].double().cpu().numpy() for maps in (answer.height, answer.sigma, answer.confidence)
+        )
         low, high = (float(x) for x in batch["height_range"][number])
         slope, base = rise(frames[0]), frames[0].world_from_camera[2, 3]
         matched, support = pair_depth(frames, window, (low, high))
@@ -48,7 +47,7 @@ def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
             better = found.depth * slope + base
             stands = (found.score >= WORST_SCORE[False]) & (better >= low) & (better <= high)
             if depth is matched:
-                stands &= (support >= 2) | (np.abs(better - said) <= GATE * sigma)
+                stands &= ~contradicted(better - said, support, sigma, sure)
             height[stands] = better[stands]
         heights.append(height)
     surface = torch.from_numpy(np.stack(heights)).to(answer.height)

@@ -65,9 +65,7 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     opinion = depth_map.opinion()
     word = None if opinion is None else opinion.resized(depth.shape[1], depth.shape[0])
     if word is not None:
-        limit = word.sigma * CONTRADICTED[0] * (CONTRADICTED[1] / CONTRADICTED[0]) ** word.confidence
-        with np.errstate(invalid="ignore"):
-            known &= ~(np.abs(word.depth - depth) > np.where(data["support"] < 2, 1, BY_PAIRS) * limit)
+        known &= ~contradicted(depth - word.depth, data["support"], word.sigma, word.confidence)
     # Speckle is judged in steps of sigma along the inverse depth, where a slope is smooth.
     middle = float(np.median(depth[known])) if known.any() else 1.0
     unit = float(np.median((data["sigma"] / depth**2)[known])) if known.any() else 1.0
@@ -93,6 +91,21 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
         "sure": word.confidence,
         "once": once,
     }
+
+
+def contradicted(off: NDArray, support: NDArray, sigma: NDArray, confidence: NDArray) -> NDArray[np.bool_]:
+    """Which matched places a network contradicts, arrays of one shape; not those of which either says nothing (NaN).
+
+    Args:
+        off: how far what was matched is from the network's word, metres.
+        support: pairs that agree.
+        sigma, confidence: of the network's word; metres, 0..1.
+    """
+    unsure, sure = CONTRADICTED
+    with np.errstate(invalid="ignore"):
+        return np.asarray(
+            np.abs(off) > sigma * unsure * (sure / unsure) ** confidence * np.where(support < 2, 1, BY_PAIRS)
+        )
 
 
 def _amiss(word: Opinion, measured: Map, shape: tuple[int, int]) -> Map:
