@@ -111,6 +111,19 @@ def test_one_frame_alone_leaves_blank_what_it_does_not_see(tmp_path: Path) -> No
     np.testing.assert_array_equal(is_meadow(rgb)[filled], ~house.on_roof(xy)[filled])
 
 
+@pytest.mark.parametrize(("side", "coloured"), [(1.0, True), (6.0, False)])
+def test_a_pit_that_no_frame_looks_into_takes_the_colour_around_it(tmp_path: Path, side: float, coloured: bool) -> None:
+    """Between leaves; ``side``: metres. A wide one stays blank."""
+    frames = house.frames(tmp_path, [house.nadir(-16, 0)])
+    grid, heights = house.surface()
+    at, xy = grid.centres(), FINE.centres()
+    heights = np.where((np.abs(at - [-6, 0]) < side / 2).all(-1), -40, heights)
+    rgb, alpha = over(frames, grid, heights).window(FINE, grid, heights)
+    bottom = (np.abs(xy - [-6, 0]) < 0.2).all(-1)
+    assert (alpha[bottom] == (FILLED if coloured else 0)).all()
+    assert (is_meadow(rgb)[bottom] == coloured).all()
+
+
 @pytest.mark.parametrize("even", [True, False])
 def test_a_darker_frame_leaves_no_step(tmp_path: Path, even: bool) -> None:
     frames = house.frames(tmp_path, exposures={5: 0.8})

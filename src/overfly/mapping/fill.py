@@ -20,7 +20,8 @@ SURE = 0.02
 def fill(rgb: NDArray[np.uint8], worth: Map, heights: Map, step: np.float32) -> NDArray[np.bool_]:
     """Give cells of the surface that no frame sees the mean colour of their neighbours at like height.
 
-    Surely seen cells come first; their colours find their way over unsure ones, which are not altered themselves.
+    Surely seen cells come first; their colours find their way over unsure ones, which are not altered themselves. Of
+    what is left, pits and spikes take the colour of whatever surrounds them; larger places stay blank.
 
     Args:
         rgb: [3, rows, columns], altered in place.
@@ -42,9 +43,19 @@ def fill(rgb: NDArray[np.uint8], worth: Map, heights: Map, step: np.float32) -> 
     doubtful = (worth > 0) & ~known
     known |= doubtful
     _carry(source, known, heights, unseen & ~known & open_, step)
+    _carry(source, known, heights, _small(unseen & ~known) & open_, np.float32(np.inf))
     filled = unseen & known
     np.copyto(rgb, source, where=filled)
     return filled
+
+
+def _small(blank: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The connected pieces [rows, columns] that are at most twice :data:`FILL` cells wide and high."""
+    import cv2
+
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(blank.astype(np.uint8), connectivity=8)
+    small = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) <= 2 * FILL
+    return blank & small[labels]
 
 
 def _carry(

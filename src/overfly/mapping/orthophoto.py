@@ -113,9 +113,9 @@ class Orthophoto:
         Returns:
             RGB [rows, columns, 3] and alpha [rows, columns], both uint8. Alpha is 255 where a photograph sees the cell;
             :data:`overfly.mapping.fill.FILLED` where none does: the colour is then that of seen cells of the same
-            surface, at most twice :data:`overfly.mapping.fill.FILL` cells away, or, of a doubtful cell, that of
-            whatever hides it; 0, and the colour black, where the surface is empty or where all that is seen is
-            farther: there no photograph tells the colour.
+            surface, at most twice :data:`overfly.mapping.fill.FILL` cells away; of pits and spikes no larger than that,
+            the colour of any surface around; of a doubtful cell, that of whatever hides it. Alpha is 0, and the colour
+            black, elsewhere: there no photograph tells the colour.
         """
         wide, inner = _widened(grid)
         fine = on_finer(heights, surface, wide)
