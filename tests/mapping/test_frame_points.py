@@ -211,14 +211,14 @@ def test_a_guess_stands_as_far_from_matched_points_as_it_must() -> None:
 
 
 def spoken(
-    camera: Camera, folder: Path, depth: NDArray[Any], support: int, said: NDArray[Any], sure: float
+    camera: Camera, folder: Path, depth: NDArray[Any], support: int, said: NDArray[Any], sure: float, views: int = 2
 ) -> DepthMap:
     """A map of which pairs have matched ``depth``, and of which a network says ``said``, give or take 1 m."""
     shape = camera.height, camera.width
     small = shape[0] // 2, shape[1] // 2
     answer = {
         "depth": said, "alone": said, "sigma": np.ones(small), "confidence": np.full(small, sure),
-        "views": np.full(small, 2, np.uint8),
+        "views": np.full(small, views, np.uint8),
     }  # fmt: skip
     path = folder / "depth.npz"
     save_arrays(path, {
@@ -248,6 +248,25 @@ def test_what_was_matched_must_not_contradict_the_network(
     assert (data["guessed"] != stands).all()
     assert (data["support"] == (support if stands else 0)).all()
     assert not data["second"][~data["guessed"]].any()
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_only_what_several_frames_show_the_network_overrules_pairs(camera: Camera, views: int, tmp_path: Path) -> None:
+    """What it says of a place that it has seen once was carried on from around, and is sure of the ground there."""
+    depth = np.full((camera.height, camera.width), 50.0)
+    said = np.full((camera.height // 2, camera.width // 2), 60.0)
+    data = cleaned(spoken(camera, tmp_path, depth, 3, said, 0.5, views))
+    assert (data["depth"] == (50 if views == 1 else 60)).all()
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_a_network_may_say_nothing(camera: Camera, views: int, tmp_path: Path) -> None:
+    depth = np.full((camera.height, camera.width), 50.0)
+    depth[:, :100] = np.nan
+    nothing = np.full((camera.height // 2, camera.width // 2), np.nan)
+    data = cleaned(spoken(camera, tmp_path, depth, 1, nothing, 0.5, views))
+    np.testing.assert_array_equal(data["depth"], depth.astype(np.float32))
+    assert not data["guessed"].any()
 
 
 def test_a_networks_word_follows_the_measured_depths_around_it(camera: Camera, tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def measure(
     ``encoders`` what retrieval needs from each network.
     """
     answers = {**baselines(batch), **{name: network(batch) for name, network in networks.items()}}
-    surfaces = [name for name in networks if answers[name].sigma is not None]
+    surfaces = [name for name in networks if answers[name].sigma is not None and answers[name].confidence is not None]
     answers |= {f"{name}, with pairs": paired(answers[name], batch) for name in surfaces}
     known = truths(batch)
     windows: list[dict[str, Any]] = [

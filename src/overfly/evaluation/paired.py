@@ -11,7 +11,8 @@ from torch import Tensor
 
 from overfly.evaluation.answers import Answer, on_grid
 from overfly.evaluation.semi_global import one_window, pair_depth, rise, shots
-from overfly.mapping.frame_points import WORST_SCORE, contradicted
+from overfly.mapping.depth_map import contradicted
+from overfly.mapping.frame_points import WORST_SCORE
 from overfly.mapping.subpixel import refine
 
 PAIR_STEPS, NETWORK_STEPS = (-1, -0.5, 0, 0.5, 1), (-2, -1, 0, 1, 2)
@@ -21,9 +22,9 @@ PAIR_STEPS, NETWORK_STEPS = (-1, -0.5, 0, 0.5, 1), (-2, -1, 0, 1, 2)
 def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
     """The answer of a network that tells a surface with sigma, corrected by pairs and by correlation.
 
-    As :mod:`overfly.mapping.stereo` and :func:`overfly.mapping.frame_points.cleaned` do: where pairs have matched and
-    all frames correlate there, their refined depth stands unless the network contradicts it; else the network's does,
-    refined where it correlates. Sigma and confidence stay those of the network.
+    Much as :mod:`overfly.mapping.stereo` and :func:`overfly.mapping.frame_points.cleaned` do it for one frame: where
+    pairs have matched and all frames correlate there, their refined depth stands unless the network contradicts it;
+    else the network's does, refined where it correlates. Sigma and confidence stay those of the network.
 
     Args:
         answer: of the network.

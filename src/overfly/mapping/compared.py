@@ -49,7 +49,7 @@ def compared(
 
     Args:
         own, data: the map and its cleaned content.
-        second: pixels [H, W] that no pair has matched.
+        second: pixels [H, W] that no pair has matched, or of which nothing is left.
         partners: to compare it with.
     """
     depth, sigma = data["depth"], data["sigma"]
@@ -62,7 +62,7 @@ def compared(
     for partner, other, before in partners:
         found, spread, given, theirs, inside = _look_up(own, depth, partner, other, before)
         visible += inside
-        # What pairs have matched is judged by what pairs have matched alone, as if no network had spoken.
+        # What pairs have matched is judged by what is left of what pairs have matched: guesses have no vote.
         found = np.where(theirs & ~second, np.float32(np.nan), found)
         with np.errstate(invalid="ignore"):
             gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))

@@ -15,6 +15,12 @@ from overfly.mapping.anchor import RIGHT, Map, anchored
 ONE_SIGMA = 0.683
 """Share of errors below one standard deviation."""
 
+CONTRADICTED, BY_PAIRS = (1.6, 8.0), 1.5
+"""What was matched is dropped if it is so many of the network's standard deviations off its word: the first where the
+network is not sure at all, since images match badly there, the second where it is quite sure and may only have rounded
+a wall off; between them in even ratios; and so many times that if several pairs agree. On eight flights up to half of
+what is dropped was right to 1 m, mostly less than a fifth; of all that one pair alone has matched 75 to 95 %."""
+
 
 @dataclass(frozen=True)
 class Opinion:
@@ -45,6 +51,15 @@ class Opinion:
         }
         return Opinion(**parts, views=cv2.resize(self.views, (width, height), interpolation=cv2.INTER_NEAREST))
 
+    def contradicts(self, depth: Map, support: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Where several frames have the place inside and their surface is another than what was matched.
+
+        Args:
+            depth: what pairs have matched, of the opinion's own size, metres.
+            support: pairs that agree.
+        """
+        return (self.views >= 2) & contradicted(depth - self.depth, support, self.sigma, self.confidence)
+
     def settled(self, measured: Map, camera: Camera, world_from_camera: Array) -> Opinion:
         """The opinion after the frame was measured: places seen once follow the measured ones around them.
 
@@ -73,6 +88,20 @@ class Opinion:
             sigma=np.where(once, sigma, self.sigma).astype(np.float32),
             confidence=np.where(once, sure, self.confidence).astype(np.float32),
         )
+
+
+def contradicted(off: NDArray, support: NDArray, sigma: NDArray, confidence: NDArray) -> NDArray[np.bool_]:
+    """Which matched places a network contradicts, arrays of one shape; not those of which either says nothing (NaN).
+
+    Args:
+        off: how far what was matched is from the network's word, metres.
+        support: pairs that agree.
+        sigma, confidence: of the network's word; metres, 0..1.
+    """
+    unsure, sure = CONTRADICTED
+    limit = sigma * unsure * (sure / unsure) ** confidence
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.abs(off) > np.where(support < 2, limit, BY_PAIRS * limit))
 
 
 @dataclass(frozen=True)

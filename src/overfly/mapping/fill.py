@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from overfly.mapping.lattice import Map
 
 FILL = 8
-"""Cells that a colour is carried on, each from surely seen cells and from any."""
+"""Cells that a colour is carried on, each from surely seen cells, from any, and into pits and spikes."""
 
 FILLED = 254
 """Alpha of cells that no photograph sees: opaque to the eye, yet told from photographed (255) and empty ones (0)."""
@@ -20,8 +20,9 @@ SURE = 0.02
 def fill(rgb: NDArray[np.uint8], worth: Map, heights: Map, step: np.float32) -> NDArray[np.bool_]:
     """Give cells of the surface that no frame sees the mean colour of their neighbours at like height.
 
-    Surely seen cells come first; their colours find their way over unsure ones, which are not altered themselves. Of
-    what is left, pits and spikes take the colour of whatever surrounds them; larger places stay blank.
+    Surely seen cells come first; their colours find their way over unsure ones, which are not altered themselves. Pits
+    and spikes, at most twice :data:`FILL` cells wide and high, that nothing of like height surrounds take the colour of
+    what does; larger places stay blank farther in.
 
     Args:
         rgb: [3, rows, columns], altered in place.
@@ -43,7 +44,7 @@ def fill(rgb: NDArray[np.uint8], worth: Map, heights: Map, step: np.float32) -> 
     doubtful = (worth > 0) & ~known
     known |= doubtful
     _carry(source, known, heights, unseen & ~known & open_, step)
-    _carry(source, known, heights, _small(unseen & ~known) & open_, np.float32(np.inf))
+    _carry(source, known, heights, _small(unseen) & ~known & open_, np.float32(np.inf))
     filled = unseen & known
     np.copyto(rgb, source, where=filled)
     return filled

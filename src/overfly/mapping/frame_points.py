@@ -33,18 +33,13 @@ NEAR, AWAY = 4, 30
 """Voxels along a cell of the plan in which one matched point makes a guess needless: the first if it is
 sure or frames agree, as the next constants say, the second else."""
 
-SURE_NEAR, AGREED_NEAR = 7.0, 0.9
-"""What lets a guess stand close to matched points: if one frame alone sees the place, the largest standard deviation,
-ground pixels; if two agree and a third says something else, the confidence. What two agree on that alone see it may."""
-
-CONTRADICTED, BY_PAIRS = (1.6, 8.0), 1.5
-"""What was matched is dropped if it is so many of the network's standard deviations off its word: the first where the
-network is not sure at all, since images match badly there, the second where it is quite sure and may only have rounded
-a wall off; between them in even ratios; and so many times that if several pairs agree. On eight flights up to half of
-what is dropped was right to 1 m, mostly less than a fifth; of all that one pair alone has matched 75 to 95 %."""
+EXACT_NEAR, AGREED_NEAR = 7.0, 0.9
+"""What a guess needs to stand close to matched points: if one frame alone sees the place, at most so many ground pixels
+of standard deviation; if a third frame says something else than the two that agree, so much confidence, which a word
+that was moved to where two images correlate never has. If no third frame sees it, nothing."""
 
 SAME_SURFACE, BESIDE, FAINT = 3.0, 2.0, 0.05
-"""A network's word is moved by what it misses measured depths by around: those that are so many of its standard
+"""A network's word is moved by what it misses matched depths by around: those that are so many of its standard
 deviations off or less, weighted by a Gaussian of so many of its pixels; the fewer there are, the less it moves."""
 
 SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.7
@@ -65,7 +60,7 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     opinion = depth_map.opinion()
     word = None if opinion is None else opinion.resized(depth.shape[1], depth.shape[0])
     if word is not None:
-        known &= ~contradicted(depth - word.depth, data["support"], word.sigma, word.confidence)
+        known &= ~(data["paired"] & word.contradicts(depth, data["support"]))
     # Speckle is judged in steps of sigma along the inverse depth, where a slope is smooth.
     middle = float(np.median(depth[known])) if known.any() else 1.0
     unit = float(np.median((data["sigma"] / depth**2)[known])) if known.any() else 1.0
@@ -78,7 +73,8 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     if opinion is None or word is None:
         return {**data, "depth": depth}
     once = word.views < 2
-    said = word.depth + np.where(once, 0, _amiss(word, depth, opinion.depth.shape))
+    matched = np.where(data["paired"] & ~once, depth, np.float32(np.nan))
+    said = word.depth + np.where(once, 0, _amiss(word, matched, opinion.depth.shape))
     # Where nothing could be measured, the network's word stands.
     guessed = ~known & np.isfinite(said)
     return {
@@ -93,39 +89,24 @@ def cleaned(depth_map: DepthMap) -> dict[str, NDArray]:
     }
 
 
-def contradicted(off: NDArray, support: NDArray, sigma: NDArray, confidence: NDArray) -> NDArray[np.bool_]:
-    """Which matched places a network contradicts, arrays of one shape; not those of which either says nothing (NaN).
-
-    Args:
-        off: how far what was matched is from the network's word, metres.
-        support: pairs that agree.
-        sigma, confidence: of the network's word; metres, 0..1.
-    """
-    unsure, sure = CONTRADICTED
-    with np.errstate(invalid="ignore"):
-        return np.asarray(
-            np.abs(off) > sigma * unsure * (sure / unsure) ** confidence * np.where(support < 2, 1, BY_PAIRS)
-        )
-
-
-def _amiss(word: Opinion, measured: Map, shape: tuple[int, int]) -> Map:
-    """By how many metres a network's depths [H, W] are too small, as the measured ones around each pixel tell.
+def _amiss(word: Opinion, matched: Map, shape: tuple[int, int]) -> Map:
+    """By how many metres a network's depths [H, W] are too small, as the matched ones around each pixel tell.
 
     Args:
         word: at full size.
-        measured: depth [H, W], NaN where nothing is.
+        matched: depth [H, W], NaN where pairs have matched nothing.
         shape: of the network's own maps, in whose pixels :data:`BESIDE` is given.
     """
     import cv2
 
-    off = measured - word.depth
+    off = matched - word.depth
     with np.errstate(invalid="ignore"):
         told = np.abs(off) < SAME_SURFACE * word.sigma
     total, weight = (
         cv2.GaussianBlur(cv2.resize(part, shape[::-1], interpolation=cv2.INTER_AREA), (0, 0), BESIDE)
         for part in (np.where(told, off, np.float32(0)), told.astype(np.float32))
     )
-    return np.asarray(cv2.resize(total / (weight + FAINT), measured.shape[::-1], interpolation=cv2.INTER_LINEAR))
+    return np.asarray(cv2.resize(total / (weight + FAINT), matched.shape[::-1], interpolation=cv2.INTER_LINEAR))
 
 
 def frame_points(
@@ -166,7 +147,7 @@ def frame_points(
     own_word = data["sure"] if "sure" in data else np.float32(0)
     confidence = np.where(guessed, own_word, _confidence(votes, agree, data["score"])).astype(np.float32)
     doubted = second & ~alone & (confidence < np.where(silent > 0, AGREED, AGREED_UNSEEN))
-    exact = seen.sigma * own.camera.fx <= SURE_NEAR * depth
+    exact = seen.sigma * own.camera.fx <= EXACT_NEAR * depth
     near = np.where(alone, data.get("once", False) & exact, (silent == 0) | (confidence >= AGREED_NEAR))
     apart = np.where(second, np.where(near, NEAR, AWAY), 0).astype(np.uint8)
     image, shown = _shown(frame, own)

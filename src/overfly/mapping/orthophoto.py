@@ -28,8 +28,8 @@ from overfly.mapping.sight import DepthBuffer, Sight, walls
 from overfly.mapping.visibility import Image, View
 from overfly.mapping.worth import EDGE, feathered, value_of
 
-MARGIN = 6
-"""Blocks computed around a window: one for filling, two each for the tone and for the votes, one for masks' filters."""
+MARGIN = 8
+"""Blocks computed around a window: three for filling, two each for tone and votes, one for masks' filters."""
 
 AMID = 3
 """Cells around doubtful ones that are as doubtful: single ones that were measured in a wood, deep between crowns."""

@@ -259,7 +259,8 @@ def _depth(
     paired = np.isfinite(full["depth"])
     opinion = None if ask is None else ask(i, chosen, _sample(depth, small, flight.poses[i]))
     if opinion is not None:
-        # It has no vote where pairs were matched: with its wide sigma it would agree with wrong matches, too.
+        # It has no vote where pairs were matched: with its wide sigma it would agree with wrong matches, too. A veto it
+        # has, when maps are compared.
         said = cv2.resize(opinion.depth, shape[::-1], interpolation=cv2.INTER_LINEAR)
         seen_again = cv2.resize(opinion.views, shape[::-1], interpolation=cv2.INTER_NEAREST) >= 2
         fill = ~np.isfinite(depth) & seen_again & np.isfinite(said)
@@ -269,7 +270,9 @@ def _depth(
         moved = refine(flight.matched_shot(i), others, guess, steps=(-2, -1, 0, 1, 2))
         filled = _at_full_size(flight, i, chosen, moved.depth, np.isfinite(moved.depth).astype(np.uint8))
         full = {name: np.where(paired, values, filled[name]) for name, values in full.items()}
-        sure = np.where((full["score"] >= SURE) & (full["support"] >= 1), full["depth"], np.float32(np.nan))
+        doubted = opinion.resized(*paired.shape[::-1]).contradicts(full["depth"], full["support"])
+        surely = (full["score"] >= SURE) & (full["support"] >= 1) & ~doubted
+        sure = np.where(surely, full["depth"], np.float32(np.nan))
         opinion = opinion.settled(sure, flight.full[i], flight.poses[i])
     kept = {
         "depth": full["depth"],
