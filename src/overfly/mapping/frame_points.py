@@ -30,8 +30,8 @@ first where further frames have the place inside and say something else, as on w
 none has. It is the network's own, or, of a word that was moved to where images correlate, that of matched points."""
 
 NEAR, AWAY = 4, 30
-"""Voxels along a cell of the plan in which one matched point makes a guess needless: the first if it is
-sure or frames agree, as the next constants say, the second else."""
+"""Voxels along a cell of the plan in which one matched point makes a guess needless: the first if it is sure
+or frames agree, as the next constants say, the second else."""
 
 EXACT_NEAR, AGREED_NEAR = 7.0, 0.9
 """What a guess needs to stand close to matched points: if one frame alone sees the place, at most so many ground pixels
