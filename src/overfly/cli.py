@@ -137,6 +137,14 @@ def map_(
         ),
     ] = None,
     cameras: Annotated[str, typer.Option(help="auto (given ones if there are any), given, or estimate.")] = "auto",
+    calibration: Annotated[
+        str | None,
+        typer.Option(
+            metavar="<path>",
+            help="Calibrated camera to be kept: folder of a map, transforms.json, COLMAP's cameras.txt, ODM's "
+            "cameras.json. Default: the flight calibrates its camera.",
+        ),
+    ] = None,
     matcher: Annotated[
         str,
         typer.Option(help="Of key points: sift, encoder (of the network), both, or auto: sift, and both if in need."),
@@ -182,6 +190,7 @@ def map_(
         network=load() if at_once else load,
         network_name=network or "shipped",
         cameras=cameras,
+        calibration=calibration,
         matcher=matcher,
         control=control,
         dense=dense,

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from overfly.flights.calibration import read_calibration, with_calibration
     from overfly.flights.cameras import CAMERAS, CameraPreset, camera_preset, find_preset
     from overfly.flights.colmap import read_colmap
     from overfly.flights.flight import ControlPoint, Flight, Frame, Gps
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from overfly.flights.write import write_flight
 
 _HOME = {
+    "read_calibration": "calibration",
+    "with_calibration": "calibration",
     "CAMERAS": "cameras",
     "CameraPreset": "cameras",
     "camera_preset": "cameras",
@@ -57,8 +60,10 @@ __all__ = [
     "fly",
     "noise_model",
     "plan_flight",
+    "read_calibration",
     "read_colmap",
     "read_flight",
+    "with_calibration",
     "write_flight",
     "write_transforms",
 ]

@@ -35,13 +35,12 @@ def read_colmap(folder: Path, source: str = "sparse/0") -> Cameras:
     binary = (folder / "cameras.bin", folder / "images.bin")
     text = (folder / "cameras.txt", folder / "images.txt")
     if all(f.is_file() for f in binary):
-        files, read_cameras, read_images = binary, _binary_cameras, _binary_images
+        files, read_images = binary, _binary_images
     elif all(f.is_file() for f in text):
-        files, read_cameras, read_images = text, _text_cameras, _text_images
+        files, read_images = text, _text_images
     else:
         raise InputError(f"{folder} is no COLMAP model: it needs cameras.bin and images.bin, or both as .txt.")
-    with _sentence(files[0]):
-        cameras = read_cameras(files[0])
+    cameras = read_colmap_cameras(files[0])
     result = Cameras(source, {}, {})
     with _sentence(files[1]):
         for camera_id, name, camera_from_world in read_images(files[1]):
@@ -50,6 +49,16 @@ def read_colmap(folder: Path, source: str = "sparse/0") -> Cameras:
     if not result.poses:
         raise InputError(f"{files[1]} holds no images: run the reconstruction again, or remove the model.")
     return result
+
+
+def read_colmap_cameras(file: Path) -> dict[int, Camera]:
+    """The cameras in ``cameras.bin`` or ``cameras.txt`` by their numbers.
+
+    Raises:
+        InputError: the file is broken, or of a camera model that :class:`Camera` cannot hold.
+    """
+    with _sentence(file):
+        return _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file)
 
 
 @contextmanager

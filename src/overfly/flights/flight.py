@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.geodesy import Origin
-from overfly.geometry import Array, Camera
+from overfly.geometry import Array, Camera, rays
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class Frame:
         path: the image file.
         width, height: pixels as stored.
         camera: calibrated camera, if the folder holds one.
+        calibration: camera that was calibrated before and that an estimation of poses keeps.
         world_from_camera: [4, 4], if the folder holds it.
         gps: from geo.txt, else EXIF.
         relative_altitude: metres above the place of take-off (XMP).
@@ -55,6 +56,7 @@ class Frame:
     width: int
     height: int
     camera: Camera | None = None
+    calibration: Camera | None = None
     world_from_camera: Array | None = None
     gps: Gps | None = None
     relative_altitude: float | None = None
@@ -70,7 +72,24 @@ class Frame:
     @property
     def camera_key(self) -> Hashable:
         """Frames with equal keys were taken by the same camera at the same settings and may share a calibration."""
-        return (self.make, self.model, self.width, self.height, self.focal_mm, self.focal35_mm, self.camera)
+        lens = (self.focal_mm, self.focal35_mm, self.camera)
+        kept = () if self.calibration is None else (self.calibration,)
+        return (self.make, self.model, self.width, self.height, *lens, *kept)
+
+    @property
+    def pinhole(self) -> Camera | None:
+        """The camera without distortion, centred and with one focal length, that stands for the calibration."""
+        if (lens := self.calibration) is None:
+            return None
+        focal = float(np.sqrt(lens.fx * lens.fy))
+        return Camera(self.width, self.height, focal, focal, self.width / 2, self.height / 2)
+
+    def straight(self, pixels: NDArray) -> Array:
+        """Pixels [..., 2] of the image as its :attr:`pinhole` would show them; as they are without a calibration."""
+        pinhole, lens = self.pinhole, self.calibration
+        if pinhole is None or lens is None:
+            return np.asarray(pixels)
+        return rays(pixels, lens)[..., :2] * pinhole.fx + [pinhole.cx, pinhole.cy]
 
     def image(self) -> NDArray[np.uint8]:
         """The pixels [H, W, 3] RGB exactly as stored: the Orientation tag is not applied.

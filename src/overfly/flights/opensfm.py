@@ -41,7 +41,7 @@ def read_reconstruction(path: Path) -> Cameras:
             f"reconstruction.json has {len(parts)} separate parts; the largest ({len(part['shots'])} images) is used, "
             f"{lost} images of the others have no camera."
         )
-    cameras = {key: _camera(key, values, path) for key, values in part.get("cameras", {}).items()}
+    cameras = {key: opensfm_camera(key, values, path) for key, values in part.get("cameras", {}).items()}
     for name, shot in part["shots"].items():
         try:
             camera = cameras[shot["camera"]]
@@ -58,7 +58,12 @@ def read_reconstruction(path: Path) -> Cameras:
     return result
 
 
-def _camera(key: str, values: dict[str, Any], path: Path) -> Camera:
+def opensfm_camera(key: str, values: dict[str, Any], path: Path) -> Camera:
+    """A camera as OpenSfM and ODM write it, in pixels; intrinsics as in :func:`read_reconstruction`.
+
+    Raises:
+        InputError: another projection; missing, wrong or NaN values.
+    """
     projection = values.get("projection_type", "perspective")
     if projection not in PROJECTIONS:
         raise unknown(f"{path}: the projection of camera {key!r}", projection, PROJECTIONS)

@@ -62,7 +62,7 @@ def read_transforms(path: Path) -> Cameras:
         values |= {key: entry[key] for key in INTRINSICS if key in entry}
         result.paths[name] = _find_image(path.parent, name, where)
         result.poses[name] = _pose(entry.get("transform_matrix"), where)
-        result.cameras[name] = _camera(values, result.paths[name], where)
+        result.cameras[name] = transforms_camera(values, result.paths[name], where)
     block = data.get("overfly")
     if block is not None:
         if not isinstance(block, dict):
@@ -102,7 +102,12 @@ def _pose(matrix: Any, where: str) -> Array:
     return pose @ OPENCV_FROM_OPENGL
 
 
-def _camera(values: dict[str, Any], image: Path, where: str) -> Camera:
+def transforms_camera(values: dict[str, Any], image: Path | None, where: str) -> Camera:
+    """A camera by its :data:`INTRINSICS`; without w and h it is as large as its image, where there is one.
+
+    Raises:
+        InputError: an unknown model, missing or NaN values; ``where`` begins the sentence.
+    """
     model = values.pop("camera_model", "OPENCV")
     if model not in CAMERA_MODELS:
         raise unknown(f"{where}: the camera_model", model, CAMERA_MODELS, "Undistort the images for other lenses.")
@@ -112,6 +117,8 @@ def _camera(values: dict[str, Any], image: Path, where: str) -> Camera:
     if "w" not in values or "h" not in values:
         from PIL import Image
 
+        if image is None:
+            raise InputError(f"{where} has no image size: give w and h in pixels.")
         try:
             with Image.open(image) as opened:
                 values["w"], values["h"] = opened.size

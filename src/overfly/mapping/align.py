@@ -50,7 +50,8 @@ def align(
     """Estimate the cameras of a flight.
 
     Args:
-        flight: frames with GPS and focal lengths where their files tell them; cameras they may have are not used.
+        flight: frames with GPS and focal lengths where their files tell them; cameras they may have are not used, a
+            ``calibration`` is kept as it is.
         workdir: features, matches and the sparse models are kept here, and reused.
         seed: of every random choice; the same seed gives the same cameras.
         bar: (step, unit) -> context manager of a function that takes (done, total).
@@ -89,7 +90,7 @@ def align(
     if guessed:
         warnings.append(
             f"The focal length of {len(guessed)} images is not known and was estimated from the images alone: "
-            "keep the photos' EXIF, or give a calibrated camera."
+            "keep the photos' EXIF, or give a calibrated camera by --calibration."
         )
     with bar("cameras", "models") as update:
         # Small matrices gain nothing by more threads, and their sums would depend on the machine.
@@ -174,7 +175,7 @@ def _held_block(
         warnings.append(
             f"The images do not tell the focal length: one that is {100 * FOCAL_TRIED:.0f} % longer would explain them "
             "as well. Differences in height may be wrong by as much: use ground control, add images from another "
-            "height, or give a calibrated camera."
+            "height, or give a calibrated camera by --calibration."
         )
     _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
     return _block(result, flight.frames, origin, metric, ruled, at is not None, apart, warnings)
@@ -219,7 +220,11 @@ def _block(
 ) -> Block:
     bundle, extra = result.bundle, 0 if ruled is None else ruled.added
     known = [
-        replace(frames[i], camera=bundle.camera(k, frames[i].width, frames[i].height), world_from_camera=bundle.pose(k))
+        replace(
+            frames[i],
+            camera=frames[i].calibration or bundle.camera(k, frames[i].width, frames[i].height),
+            world_from_camera=bundle.pose(k),
+        )
         for k, i in enumerate(bundle.frames.tolist())
     ]
     tied = bundle.point < len(bundle.points) - extra

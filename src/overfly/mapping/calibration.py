@@ -54,13 +54,14 @@ def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
     """What the images and the photos' own data say of a bundle: the weights of its rays, priors of its cameras."""
     own = [frames[i] for i in bundle.frames]
     count = np.bincount(bundle.lens_of, minlength=len(bundle.lenses))
-    focals = [focal_px(own[int(np.flatnonzero(bundle.lens_of == j)[0])]) or np.nan for j in range(len(count))]
+    first = [int(np.flatnonzero(bundle.lens_of == j)[0]) for j in range(len(count))]
+    focals = [focal_px(own[i]) or np.nan for i in first]
     return replace(
         free(bundle, NOISE_PX * _shrunk(bundle, frames)),
         focals=np.array(focals, float),
         focal_sigma=FOCAL_SIGMA,
         lens_sigma=NO_LENS_SIGMA,
-        lens_fixed=count < FEWEST_TO_CALIBRATE,
+        lens_fixed=(count < FEWEST_TO_CALIBRATE) | [own[i].calibration is not None for i in first],
     )
 
 

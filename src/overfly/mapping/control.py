@@ -137,6 +137,7 @@ def read_controls(flight: Flight, bundle: Bundle, origin: Origin, warnings: list
             if not (0 <= u <= frame.width and 0 <= v <= frame.height):
                 outside.add(f"{point.name} in {name}")
             elif number in image_of:
+                u, v = frame.straight(np.array([u, v])).tolist()
                 clicks.append((image_of[number], (u, v)))
         found.append(Control(point.name, place, tuple(sorted(clicks))))
     if absent:

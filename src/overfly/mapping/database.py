@@ -24,10 +24,12 @@ MODEL = "RADIAL"
 
 
 def focal_px(frame: Frame) -> float | None:
-    """Focal length in pixels by the camera's data sheet, the EXIF focal-plane tags or the 35 mm equivalent.
+    """Focal length in pixels by a calibration, the camera's data sheet, the EXIF focal plane or the 35 mm equivalent.
 
     An image of another shape than the sensor is a part of it that fills it in one direction.
     """
+    if frame.pinhole is not None:
+        return frame.pinhole.fx
     if frame.model and frame.focal_mm:
         try:
             preset = find_preset(frame.model)

@@ -13,7 +13,7 @@ import numpy as np
 
 from overfly import __version__
 from overfly.errors import InputError
-from overfly.flights import Flight, read_flight
+from overfly.flights import Flight, read_calibration, read_flight, with_calibration
 from overfly.geodesy import crs_code
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
@@ -110,7 +110,15 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
     check_place(flight, asked.heights, estimate=estimate, control=asked.control)
     steps.say("images", _about(flight))
     ruled = [asked.control] if flight.gcps and asked.control != "split" else []
-    matched = [asked.seed, *ruled, *asked.matcher_key()]
+    if asked.calibration is not None:
+        if not estimate:
+            raise InputError(
+                f"The flight has cameras of its own ({flight.cameras_from}), so that --calibration {asked.calibration} "
+                "would not be used: add --cameras estimate, or leave it out."
+            )
+        flight = with_calibration(flight, read_calibration(asked.calibration), asked.calibration)
+    lenses = sorted({repr(f.calibration) for f in flight.frames if f.calibration is not None})
+    matched = [asked.seed, *ruled, *asked.matcher_key(), *lenses]
     key = key_of(__version__, BLOCK_FORM, identity, estimate, matched if estimate else None)
     block = steps.kept(
         "cameras",

@@ -59,7 +59,8 @@ def matched(
         folder.mkdir(exist_ok=True)
         with bar("features", "images") as update:
             for i, frame in enumerate(flight.frames):
-                found[i] = features(frame, folder)
+                pixels, descriptors = features(frame, folder)
+                found[i] = frame.straight(pixels), descriptors
                 update(i + 1, len(flight))
         _, guessed = open_database(database, flight, found)
         with bar("pairs", "images") as update:
@@ -75,13 +76,12 @@ def matched(
     known = np.zeros(len(flight), bool) if told is None else np.isfinite(told[:, :2]).all(1)
     with bar("correspondences", "pairs") as update:
         pairs = sorted({*pairs, *_alike(flight.frames, np.flatnonzero(~known).tolist(), encoder)})
-        pixels, more = encoder_matches(
-            flight.frames, pairs, encoder, priors=priors(flight.frames, told), progress=update
-        )
+        also, more = encoder_matches(flight.frames, pairs, encoder, priors=priors(flight.frames, told), progress=update)
+    also = [frame.straight(own) for frame, own in zip(flight.frames, also, strict=True)]
     for (i, j), rows in more.items():
         rows = rows + np.array([len(found[i][0]), len(found[j][0])], np.uint32)  # behind the points of SIFT
         matches[i, j] = np.concatenate([matches[i, j], rows]) if (i, j) in matches else rows
-    found = [(np.concatenate([own, others]), d) for (own, d), others in zip(found, pixels, strict=True)]
+    found = [(np.concatenate([own, others]), d) for (own, d), others in zip(found, also, strict=True)]
     database = workdir / f"matches_{matcher}.db"
     return database, write_matches(database, flight, found, matches, seed=seed)
 

@@ -33,6 +33,8 @@ class MapSettings:
 
     Attributes:
         cameras: "given" takes those of the flight folder, "estimate" ignores them, "auto" takes them if there are any.
+        calibration: file or folder with the calibrated camera (:func:`overfly.flights.read_calibration`) that an
+            estimation keeps; None: the camera is calibrated by the flight itself.
         matcher: what finds the key points from which cameras are estimated: "sift", the network's "encoder", "both", or
             "auto": SIFT, and both where its matches are too few to place the images.
         control: what ground control points do: "split" keeps a quarter of four or more to check the map, "all" lets all
@@ -56,6 +58,7 @@ class MapSettings:
     """
 
     cameras: str = "auto"
+    calibration: str | None = None
     matcher: str = "auto"
     control: str = "split"
     dense: str = "sweep"
@@ -75,6 +78,11 @@ class MapSettings:
     def __post_init__(self) -> None:
         if self.cameras not in CAMERAS:
             raise unknown("--cameras", self.cameras, CAMERAS)
+        if self.calibration is not None and self.cameras == "given":
+            raise InputError(
+                "--calibration serves to estimate cameras, and --cameras given takes those of the flight folder: "
+                "leave one of them out."
+            )
         if self.matcher not in MATCHERS:
             raise unknown("--matcher", self.matcher, MATCHERS)
         if self.control not in CONTROL:
@@ -141,6 +149,7 @@ class MapSettings:
         """For the report and map.json."""
         return {
             "cameras": self.cameras,
+            "calibration": self.calibration,
             "dense": self.dense,
             "matcher": self.matcher,
             "control": self.control,

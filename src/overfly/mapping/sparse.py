@@ -54,6 +54,7 @@ def sparse_parts(
     """
     names = [frame.name for frame in flight.frames]
     numbers = {name: i for i, name in enumerate(names)}
+    calibrated = all(frame.calibration is not None for frame in flight.frames)
 
     def found(folder: Path, calibrate: bool) -> list[Bundle]:
         models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
@@ -61,7 +62,7 @@ def sparse_parts(
 
     def built_up(folder: Path) -> list[Bundle]:
         held = [] if len(guessed) == len(names) else found(folder / "held", calibrate=False)
-        if held and len(held[0]) == len(names):
+        if (held and len(held[0]) == len(names)) or calibrated:
             return held
         free = found(folder, calibrate=True)
         return free if not held or (free and len(free[0]) > len(held[0])) else held
