@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from overfly.configuration import build
-from overfly.errors import InputError
+from overfly.errors import InputError, unknown
 from overfly.evaluation import Baselines, Network, evaluate
+from overfly.evaluation.cameras import ESTIMATED, estimate_all
 from overfly.evaluation.evaluate import KEPT
-from overfly.run import Run, load_run
+from overfly.run import Run
 from overfly.shipped import load_network
 
 log = logging.getLogger("overfly")
+
+CAMERAS = ("exact", "estimated")
 
 TRAINING_WINDOWS = 240
 """Training windows, spread over all flights, among which the mean and the nearest one are looked for."""
@@ -27,7 +31,7 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
 
     Args:
         cfg: with ``from_run``, ``networks`` (run folders or shipped networks by the name in the table),
-            ``emd_windows``, ``every`` and ``draws``.
+            ``emd_windows``, ``every``, ``cameras`` and ``draws``.
         run_dir: gets evaluation.md, evaluation.csv and evaluation.png; with ``resume`` it goes on where it stopped.
 
     Returns:
@@ -36,9 +40,14 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     Raises:
         InputError: there is no network or nothing to evaluate on.
     """
+    if cfg.cameras not in CAMERAS:
+        raise unknown("cameras", cfg.cameras, CAMERAS)
     if cfg.from_run is None:
-        raise InputError("stage=evaluate needs a trained network: give from_run=outputs/all/<a run folder>.")
-    run = load_run(cfg.from_run)
+        raise InputError(
+            "stage=evaluate needs a trained network: give from_run=outputs/all/<a run folder>, or from_run=base for "
+            "the shipped one."
+        )
+    run = load_network(str(cfg.from_run))
     own = _name(run)
     others = {str(name): load_network(str(folder)) for name, folder in (cfg.networks or {}).items()}
     if own in others:
@@ -57,8 +66,16 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
         data.datasets[split].windows = data.datasets[split].windows[:: cfg.every]
     if not cfg.resume:
         (run_dir / KEPT).unlink(missing_ok=True)
+        shutil.rmtree(run_dir / ESTIMATED, ignore_errors=True)
+    if cfg.cameras == "estimated":
+        encoder = getattr(run.network, "encoder", None)
+        dense = encoder if hasattr(encoder, "dense") else None
+        estimate_all(data.datasets, run_dir / ESTIMATED, None if dense is None else lambda: dense)
 
     def baselines() -> Baselines:
+        if "data" not in run.config:
+            log.info("Of %s only the weights are here: no mean and no nearest training window", cfg.from_run)
+            return Baselines(None, networks[own], cfg.points)
         log.info("Looking at the training windows of %s, for the mean and the nearest one", cfg.from_run)
         trained = _training_data(run, cfg.cache_dir)
         looked_at = trained.datasets["train"] = trained.dataset("train")

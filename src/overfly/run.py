@@ -226,7 +226,7 @@ def load_run(folder: Path | str) -> Run:
     if path.suffix == ".safetensors":
         raise InputError(
             f"{folder} is a shipped network, of which only the weights are here: give a run folder. "
-            f"stage=full from_run={folder} trains it further, networks={{shipped: {folder}}} evaluates it beside a run."
+            f"stage=full from_run={folder} trains it further, stage=evaluate from_run={folder} evaluates it."
         )
     register_resolvers()
     root = path.parent.parent

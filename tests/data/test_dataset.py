@@ -160,3 +160,27 @@ def test_other_colours_are_the_same_in_all_frames_of_a_window() -> None:
     assert found.min() >= 0
     assert found.max() <= 1
     np.testing.assert_allclose(recoloured(twice, 0.0, np.random.default_rng(1)), twice, atol=1e-6)
+
+
+def test_estimated_cameras_take_the_place_of_the_true_ones(record_folder: Path) -> None:
+    data, plain = (WindowDataset([folder], EXACT, seed=5, augment=False) for folder in (record_folder, record_folder))
+    number, chosen = data.windows[2]
+    lost = chosen[2]
+    found = make_record().world_from_camera.copy()
+    found[:, 0, 3] += 0.5  # metres to the east, all alike
+    found[lost] = np.nan
+    data.estimated[number] = found
+    item, exact = data[2], plain[2]
+    scale = float(item["scale"])
+    assert item["placed"].tolist() == [True, True, False]
+    assert torch.equal(item["images"][2], item["images"][0])  # the reference again, as where neighbours are few
+    away = torch.linalg.inv(item["true_camera_from_window"].double()) - torch.linalg.inv(
+        item["camera_from_window"].double()
+    )
+    assert away[:2, :3, 3].numpy() * scale == pytest.approx(np.tile([-0.5, 0, 0], (2, 1)), abs=1e-4)
+    assert "placed" not in exact
+    assert torch.equal(item["images"][:2], exact["images"][:2])
+    found[chosen[0]] = np.nan
+    alone = data[2]
+    assert not alone["placed"][0]
+    assert all(torch.equal(alone["images"][k], exact["images"][0]) for k in range(3))

@@ -60,6 +60,12 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
         self.augment = augment
         self.twice = False
         """Whether items hold ``reference_again`` [N, 3], an independent sample of the same surface."""
+        self.estimated: dict[int, Array] = {}
+        """Poses [n, 4, 4] to go by instead of the true ones, by record; NaN: a frame that was not placed.
+
+        Items then hold the true poses as ``true_camera_from_window`` [K, 4, 4], and ``placed`` [K]. Frames that were
+        not placed are left out like those of a map; a reference that was not is looked at alone, by its prior.
+        """
         self.windows = [
             (number, window) for number, record in enumerate(self.records) for window in _windows(record, settings)
         ]
@@ -79,16 +85,21 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
             chosen = [chosen[0], *(chosen[0] if rng.random() < settings.drop_share else i for i in chosen[1:])]
             low, high = height_range(float(record.world_from_camera[chosen[0], 2, 3] - ground))
             heights = (low * rng.uniform(0.8, 1.3), high * rng.uniform(0.8, 1.3))
+        found = self.estimated.get(number)
+        placed = np.ones(len(chosen), bool) if found is None else np.isfinite(found[chosen, 0, 0])
+        chosen = [i if ok and placed[0] else chosen[0] for i, ok in zip(chosen, placed, strict=True)]
         poses, images, cameras, depth = self._frames(record, chosen)
+        priors = disturbed(poses, settings.position_sigma_m, settings.rotation_sigma_deg, rng)
+        seen_from = poses if found is None else found[chosen]
+        if not placed[0]:
+            seen_from = np.repeat(priors[:1], len(chosen), axis=0)
         sample, world_from_window = window_sample(
-            images,
-            cameras,
-            poses,
-            ground,
-            prior_world_from_camera=disturbed(poses, settings.position_sigma_m, settings.rotation_sigma_deg, rng),
-            heights=heights,
+            images, cameras, seen_from, ground, prior_world_from_camera=priors, heights=heights
         )
         scale = float(sample["scale"])
+        if found is not None:
+            sample["true_camera_from_window"] = camera_from_window(poses, world_from_window, scale).astype(np.float32)
+            sample["placed"] = placed
         if self.augment:
             if settings.colour_sigma:
                 sample["images"] = recoloured(sample["images"], settings.colour_sigma, rng)
@@ -99,7 +110,7 @@ class WindowDataset(Dataset[dict[str, torch.Tensor]]):
             shaken[[i == chosen[0] for i in chosen]] = poses[0]
             sample["camera_from_window"] = camera_from_window(shaken, world_from_window, scale).astype(np.float32)
         sample["depth"] = depth / np.float32(scale)
-        area = footprint(cameras[0], poses[0], ground)
+        area = footprint(cameras[0], seen_from[0], ground)
         for name in ("reference", "reference_again") if self.twice else ("reference",):
             sample[name] = reference_points(record, area, world_from_window, scale, settings.points, rng)
         if self.augment and rng.random() < 0.5:

@@ -22,6 +22,11 @@ from overfly.stages.surfaces import RIGHT_PX, true_heights
 Batch = Mapping[str, Tensor]
 
 
+def as_true(batch: Batch) -> dict[str, Tensor]:
+    """The windows as the true cameras see them, where methods were given estimated ones."""
+    return {**batch, "camera_from_window": batch.get("true_camera_from_window", batch["camera_from_window"])}
+
+
 @dataclass(frozen=True)
 class Answer:
     """Clouds and surfaces of B windows, in window units.
@@ -47,14 +52,16 @@ class Baselines:
     """The answers that need no trained network of their own.
 
     Args:
-        train: batches of the training windows.
+        train: batches of the training windows; none for a network whose training data are not at hand: then neither
+            their mean nor the nearest of them is an answer.
         encoder: whose descriptors find the nearest of them.
         points: of a cloud, a square number.
     """
 
-    def __init__(self, train: Iterable[Batch], encoder: Network, points: int) -> None:
-        self.points, self.encoder, self.nearest = points, encoder, NearestWindow()
-        self.mean = mean_heights(self._remembered(train), points)
+    def __init__(self, train: Iterable[Batch] | None, encoder: Network, points: int) -> None:
+        self.points, self.encoder = points, encoder
+        self.nearest = NearestWindow()
+        self.mean = None if train is None else mean_heights(self._remembered(train), points)
 
     def _remembered(self, train: Iterable[Batch]) -> Iterator[Batch]:
         for batch in train:
@@ -66,12 +73,14 @@ class Baselines:
         flat = initial_cloud(self.points, batch)
         height, width = batch["images"].shape[-2:]
         zero = batch["images"].new_zeros(len(flat), height, width)
-        side = grid_side(self.points)
-        mean = F.interpolate(self.mean.to(flat).reshape(1, 1, side, side), (height, width), mode="bilinear")
-        return {
-            FLAT: Answer(flat, zero),
-            "mean training cloud": Answer(lifted(flat, self.mean), mean[0].expand_as(zero)),
-            "nearest training window": _of_cloud(self.nearest(self.encoder.describe(batch)).to(flat), batch),
+        answers = {FLAT: Answer(flat, zero)}
+        if self.mean is not None:
+            side = grid_side(self.points)
+            mean = F.interpolate(self.mean.to(flat).reshape(1, 1, side, side), (height, width), mode="bilinear")
+            answers["mean training cloud"] = Answer(lifted(flat, self.mean), mean[0].expand_as(zero))
+            nearest = self.nearest(self.encoder.describe(batch)).to(flat)
+            answers["nearest training window"] = _of_cloud(nearest, batch)
+        return answers | {
             "correlation sweep": self._of_heights(correlation_sweep(batch), batch),
             "semi-global stereo": self._of_heights(semi_global(batch), batch),
             FLOOR: self._exact(batch),
@@ -82,6 +91,7 @@ class Baselines:
         return Answer(on_grid(found.height, batch, self.points), found.height, measured=found.measured)
 
     def _exact(self, batch: Batch) -> Answer:
+        batch = as_true(batch)
         height, width = batch["images"].shape[-2:]
         true, known = true_heights(batch, width, height)
         true = torch.where(known, true, torch.zeros_like(true))

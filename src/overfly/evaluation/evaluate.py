@@ -14,9 +14,9 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from overfly.data.dataset import WindowDataset
-from overfly.evaluation.answers import Baselines, Batch, Network
+from overfly.evaluation.answers import Baselines, Batch, Network, as_true
 from overfly.evaluation.chart import draw
-from overfly.evaluation.measure import Values, cloud_values, surface_values, truths
+from overfly.evaluation.measure import Values, camera_values, cloud_values, surface_values, truths
 from overfly.evaluation.paired import paired
 from overfly.evaluation.table import Row, tabulate, write_table
 from overfly.files import replacing
@@ -123,7 +123,8 @@ def measure(
     for name, answer in answers.items():
         for number, (window, truth) in enumerate(zip(windows, known, strict=True)):
             values, calibration = surface_values(answer, number, truth)
-            window["clouds"][name] = {**cloud_values(answer, number, truth, emd=emd[number]), **values}
+            cameras = camera_values(batch, number)
+            window["clouds"][name] = {**cloud_values(answer, number, truth, emd=emd[number]), **values, **cameras}
             if calibration is not None:
                 window["calibration"][name] = calibration
     for name, network in networks.items():
@@ -138,6 +139,7 @@ def _encoder(network: Network, batch: Batch) -> list[tuple[Values, dict[str, Any
     if batch["images"].shape[1] < 2:
         return [({}, {"descriptors": [], "overlaps": []}) for _ in batch["index"]]
     output, seen = network.encode(batch)
+    seen = as_true(seen)
     overlaps = batch["overlaps"].masked_fill(repeated(batch), -1.0)
     found = []
     for b in range(len(overlaps)):

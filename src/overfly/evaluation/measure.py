@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from overfly.evaluation.answers import Answer
+from overfly.evaluation.answers import Answer, as_true
 from overfly.metrics.functional import harmonic
 from overfly.networks.baselines import interpolated
 from overfly.networks.ground import Rays, pixel_centres, rays
@@ -71,7 +71,7 @@ class Truth:
 
 def truths(batch: Mapping[str, Tensor]) -> list[Truth]:
     """The truth about every window of a batch."""
-    batch = {name: value.cpu() for name, value in batch.items()}
+    batch = {name: value.cpu() for name, value in as_true(batch).items()}
     height, width = batch["images"].shape[-2:]
     cells = pixel_centres(width, height, width, height, torch.device("cpu"))
     cast = rays(cells, batch["intrinsics"][:, 0], batch["camera_from_window"][:, 0])
@@ -111,6 +111,37 @@ def count_views(batch: Mapping[str, Tensor], points: Tensor) -> Tensor:
         new = ~again[:, k, :k].any(1)
         count += (shown & new[:, None]).long()
     return count
+
+
+def camera_values(batch: Mapping[str, Tensor], number: int) -> Values:
+    """How good the estimated cameras of a window of a batch are: nothing where methods were given the true ones.
+
+    ``cameras_placed`` is the share of its frames that were placed, ``cameras_px`` the median distance, in pixels of the
+    other frames, between where the estimated and the true poses put what the reference frame sees.
+    """
+    if "placed" not in batch:
+        return {}
+    values: Values = {"cameras_placed": (float(batch["placed"][number].double().mean()), 1.0)}
+    depth = batch["depth"][number, 0].flatten().double()
+    height, width = batch["depth"].shape[-2:]
+    pixels = pixel_centres(width, height, width, height, depth.device).double()
+    intrinsics = batch["intrinsics"][number].double()
+    ones = torch.ones_like(pixels[:, :1])
+    local = torch.cat([torch.cat([pixels, ones], 1) @ intrinsics[0].inverse().T * depth[:, None], ones], 1)[depth > 0]
+    off = []
+    for k in range(1, len(intrinsics)):
+        if repeated(batch)[number, k, :k].any():
+            continue
+        shown = []
+        for name in ("camera_from_window", "true_camera_from_window"):
+            poses = batch[name][number].double()
+            there = (local @ (poses[k] @ poses[0].inverse()).T)[:, :3] @ intrinsics[k].T
+            shown.append(torch.where(there[:, 2:] > 0, there[:, :2] / there[:, 2:], torch.nan))
+        inside = ((shown[1] > 0) & (shown[1] < shown[1].new_tensor([width, height]))).all(1)
+        off.append((shown[0] - shown[1]).norm(dim=1)[inside])
+    if off and len(every := torch.cat(off)) >= LEAST_PIXELS:
+        values["cameras_px"] = (float(every.nanmedian()), 1.0)
+    return values
 
 
 def cloud_values(answer: Answer, number: int, truth: Truth, *, emd: bool) -> Values:

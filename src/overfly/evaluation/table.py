@@ -26,7 +26,8 @@ METRICS = (
     "height_mean_percent_1_view", "height_mean_percent_2_views", "height_mean_percent_3_views",
     "area_1_view", "area_2_views", "area_3_views",
     "fscore_once_2pct", "fscore_once_interpolated_2pct", "measured",
-    "within_sigma", "within_2sigma", "match_top1", "retrieval_top1", "retrieval_verified_top1",
+    "cameras_placed", "cameras_px", "within_sigma", "within_2sigma",
+    "match_top1", "retrieval_top1", "retrieval_verified_top1",
 )  # fmt: skip
 """Weighted means over windows; see :mod:`overfly.evaluation.measure`."""
 
@@ -58,6 +59,8 @@ scenes (one scene is one flight), given from {least} scenes on; evaluation.csv h
 - `fscore_once_2pct`: F-score of the places that one frame sees alone; `fscore_once_interpolated_2pct`: the same with
   heights interpolated from the method's own answer where more frames see the ground.
 - `measured`: share of the pixels that a classical method measured; it fills in the others.
+- with `cameras=estimated`, `cameras_placed`: share of a window's frames that were placed (the others are left out);
+  `cameras_px`: how far from the truth their poses put what the reference frame sees, pixels (median).
 - `within_sigma`, `within_2sigma`: shares of errors below the stated sigma, ideally 0.68 and 0.95;
   `calibration_error`: expected difference between the stated confidence and the share that is right.
 - `match_top1`: key points whose match is within 2 px of the truth; `retrieval_top1`: frames whose most similar other
