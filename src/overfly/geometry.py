@@ -22,6 +22,10 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL (x right, y up, z back) to OpenCV (x right, y down, z forward); its own inverse."""
 
 
+BORDER = 65
+"""Points along each border of an image at which a lens formula must have an inverse."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera with OpenCV's radial (k1, k2, k3) and tangential (p1, p2) distortion. Lengths in pixels."""
@@ -131,6 +135,14 @@ def undistort(distorted: ArrayLike, camera: Camera, iterations: int = 20) -> Arr
             break
     solved = np.abs(distort(points, camera) - target).max(-1) < 1e-7
     return np.where((solved & ((points**2).sum(-1) < fold(camera)))[..., None], points, np.nan)
+
+
+def invertible(camera: Camera) -> bool:
+    """Whether every pixel of the image has a ray: a strong lens formula may fold back before the border."""
+    u, v = np.linspace(0, camera.width, BORDER), np.linspace(0, camera.height, BORDER)
+    sides = [np.stack([u, 0 * u + y], 1) for y in (0, camera.height)]
+    sides += [np.stack([0 * v + x, v], 1) for x in (0, camera.width)]
+    return bool(np.isfinite(rays(np.concatenate(sides), camera)).all())
 
 
 def project(points: ArrayLike, camera: Camera, world_from_camera: ArrayLike) -> tuple[Array, Array]:

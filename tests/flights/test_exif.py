@@ -122,3 +122,42 @@ def test_a_truncated_jpeg_with_a_thumbnail_is_found_and_trailing_bytes_are_no_de
     assert defect(tmp_path / "b.jpg")
     (tmp_path / "c.jpg").write_bytes(whole + bytes(1000))
     assert defect(tmp_path / "c.jpg") is None
+
+
+DEWARP = "2018-09-06;3684.48,3677.57,2.24,22.05,-0.263482,0.106788,0.0000371107,-0.000327247,-0.0300783"
+
+
+def dewarp(data: str, flag: int = 0, middle: tuple[float, float] = (2736, 1824)) -> bytes:
+    """A survey drone's packet."""
+    return (
+        f'<x:xmpmeta drone-dji:CalibratedOpticalCenterX="{middle[0]}" drone-dji:CalibratedOpticalCenterY="{middle[1]}" '
+        f'drone-dji:DewarpData=" {data}" drone-dji:DewarpFlag="{flag}" drone-dji:RtkFlag="50"/>'
+    ).encode()
+
+
+def test_the_lens_that_the_maker_measured_is_scaled_to_the_image(tmp_path: Path) -> None:
+    lens = read_facts(save(tmp_path / "a.jpg", xmp=dewarp(DEWARP))).lens
+    assert lens is not None
+    scale = 60 / 5472
+    assert (lens.width, lens.height) == (60, 40)
+    assert lens.fx == pytest.approx(3684.48 * scale)
+    assert lens.fy == pytest.approx(3677.57 * 40 / 3648)
+    assert (lens.cx, lens.cy) == pytest.approx(((2736 + 2.24) * scale, (1824 + 22.05) * 40 / 3648))
+    assert (lens.k1, lens.k2, lens.k3) == (-0.263482, 0.106788, -0.0300783)
+    assert (lens.p1, lens.p2) == (0.0000371107, -0.000327247)
+
+
+@pytest.mark.parametrize(
+    ("packet", "note"),
+    [
+        (dewarp(DEWARP, flag=1), None),  # the camera has straightened the image itself
+        (dewarp("2022-06-08;" + ",".join(["0.0"] * 9)), None),
+        (dewarp(DEWARP, middle=(1824, 2736)), None),  # another shape: a part of the image, or turned
+        (dewarp("2018-09-06;3684.48,3677.57"), "unreadable DewarpData"),
+        (dewarp("2018-09-06;3684,3677,2,22,-9,0,0,0,0"), "unreadable DewarpData"),
+    ],
+)
+def test_a_lens_that_cannot_be_used_is_none(tmp_path: Path, packet: bytes, note: str | None) -> None:
+    facts = read_facts(save(tmp_path / "a.jpg", xmp=packet))
+    assert facts.lens is None
+    assert facts.notes == ([note] if note else [])

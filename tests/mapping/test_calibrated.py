@@ -12,8 +12,9 @@ from conftest import ORIGIN, bar, nadir
 from overfly.errors import InputError
 from overfly.flights import ControlPoint, Flight, with_calibration, write_transforms
 from overfly.geodesy import crs_from_enu
-from overfly.geometry import Camera, project
+from overfly.geometry import Array, Camera, distort, pixel_grid, project, rays
 from overfly.mapping.align import align
+from overfly.mapping.calibration import composed
 from overfly.mapping.map import align_flight
 
 pytestmark = pytest.mark.usefixtures("few_features")
@@ -84,3 +85,41 @@ def test_a_flight_with_cameras_of_its_own_does_not_ask_for_a_calibration(hill, t
 def test_given_cameras_and_a_calibration_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="leave one of them out"):
         align_flight(tmp_path, out=tmp_path / "map", dense="stereo", cameras="given", calibration="x", progress=False)
+
+
+RAW = Camera(320, 240, 250.0, 250.5, 161.0, 122.0, k1=-0.26, k2=0.11, p1=1e-4, p2=-3e-4, k3=-0.03)
+"""As survey drones store images: nothing straightened."""
+
+WARM = replace(RAW, fx=1.002 * RAW.fx, fy=1.002 * RAW.fy, k1=-0.255)
+"""The same lens on a hot day."""
+
+
+def bent(lens: Camera, frame, residual: Camera, points: Array) -> Array:  # type: ignore[no-untyped-def]
+    """Pixels of ideal coordinates [k, 2] by a lens and what was found on top of it."""
+    straight = distort(points, residual) * residual.fx / frame.pinhole.fx
+    return distort(straight, lens) * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+
+
+def test_a_lens_and_what_was_found_on_top_of_it_are_one_camera(line) -> None:  # type: ignore[no-untyped-def]
+    frame = replace(line.frames[0], lens=RAW)
+    assert composed(RAW, frame.pinhole) == RAW
+    residual = replace(frame.pinhole, fx=frame.pinhole.fx * 1.01, fy=frame.pinhole.fy * 1.01, k1=0.004, k2=-0.003)
+    points = rays(pixel_grid(320, 240)[::20, ::20], RAW)[..., :2].reshape(-1, 2)
+    whole = composed(RAW, residual)
+    found = distort(points, whole) * [whole.fx, whole.fy] + [whole.cx, whole.cy]
+    inside = ((found > 0) & (found < [320, 240])).all(1)
+    assert np.abs(found - bent(RAW, frame, residual, points))[inside].max() < 0.02
+
+
+def test_the_lens_in_the_photos_is_where_the_calibration_starts(hill, strips, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "flight").mkdir()
+    flight = hill.flight(tmp_path / "flight", WARM, strips)
+    told = replace(flight, frames=[replace(f, lens=RAW, focal_px=None) for f in flight.frames])
+    block = align(told, workdir=tmp_path / "told", seed=0, bar=bar)
+    assert len(block.frames) == 8
+    assert block.reprojection_px < 0.3
+    truth = np.array([pose[:3, 3] for pose in strips])
+    assert np.abs(block.poses[:, :3, 3] - truth - np.median(block.poses[:, :3, 3] - truth, axis=0)).max() < 0.3
+    points = rays(pixel_grid(320, 240)[::20, ::20], WARM)[..., :2].reshape(-1, 2)
+    pixels = [distort(points, c) * [c.fx, c.fy] + [c.cx, c.cy] for c in (block.cameras[0], WARM)]
+    assert np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)) < 0.5

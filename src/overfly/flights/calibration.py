@@ -8,14 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from overfly.errors import InputError
 from overfly.flights.colmap import read_colmap_cameras
+from overfly.flights.exif import SHAPE
 from overfly.flights.flight import Flight, Frame
 from overfly.flights.opensfm import opensfm_camera
 from overfly.flights.transforms import INTRINSICS, transforms_camera
-from overfly.geometry import Camera, undistort
+from overfly.geometry import Camera, invertible
 
 FILES = (
     "transforms.json",
@@ -30,12 +29,6 @@ FILES = (
     "camera_models.json",
 )
 """Where a folder may hold cameras, in the order in which they are looked for."""
-
-SHAPE = 0.01
-"""Share by which the shape of an image may differ from the calibrated one: sizes are rounded."""
-
-BORDER = 65
-"""Points along each border of an image at which a lens formula must have an inverse."""
 
 
 def read_calibration(path: Path | str) -> list[Camera]:
@@ -118,12 +111,7 @@ def _opensfm(cameras: Mapping[str, Any], file: Path) -> list[Camera]:
 
 
 def _check_lens(camera: Camera, file: Path) -> None:
-    u, v = np.linspace(0, camera.width, BORDER), np.linspace(0, camera.height, BORDER)
-    sides = [np.stack([u, 0 * u + y], 1) for y in (0, camera.height)] + [
-        np.stack([0 * v + x, v], 1) for x in (0, camera.width)
-    ]
-    ideal = (np.concatenate(sides) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    if not np.isfinite(undistort(ideal, camera)).all():
+    if not invertible(camera):
         raise InputError(
             f"The lens in {file} (k1={camera.k1:g}, k2={camera.k2:g}, k3={camera.k3:g}) has no inverse at the border "
             "of the image: calibrate the camera again, or leave --calibration out."

@@ -5,18 +5,23 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from overfly.flights.flight import Gps
+from overfly.geometry import Camera, invertible
 
 MAKE, MODEL, ORIENTATION, DATE_TIME, SOFTWARE, XMP = 0x010F, 0x0110, 0x0112, 0x0132, 0x0131, 0x02BC
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
 DATE_TIME_ORIGINAL, SUBSEC_ORIGINAL, FOCAL, FOCAL_35 = 0x9003, 0x9291, 0x920A, 0xA405
 PLANE_X, PLANE_UNIT, PIXELS_X, PIXELS_Y = 0xA20E, 0xA210, 0xA002, 0xA003
 PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+SHAPE = 0.01
+"""Share by which the shape of an image may differ from the calibrated one: sizes are rounded."""
+
 DJI_NAMESPACE = "http://www.dji.com/drone-dji/1.0/"
 
 
@@ -37,6 +42,7 @@ class Facts:
     relative_altitude: float | None = None
     absolute_altitude: float | None = None
     gimbal: tuple[float, float, float] | None = None
+    lens: Camera | None = None
     notes: list[str] = field(default_factory=list)
 
 
@@ -152,10 +158,35 @@ def _read_xmp(packet: str, facts: Facts) -> None:
     yaw, pitch, roll = (value(f"Gimbal{axis}Degree") for axis in ("Yaw", "Pitch", "Roll"))
     if yaw is not None and pitch is not None:
         facts.gimbal = (yaw, pitch, roll or 0.0)
+    _read_lens(packet, value, facts)
     stds = [value(f"RtkStd{axis}") for axis in ("Lat", "Lon", "Hgt")]
     if facts.gps is not None and all(stds):
         gps = facts.gps
         facts.gps = Gps(gps.latitude, gps.longitude, gps.altitude, max(stds[0] or 0, stds[1] or 0), stds[2])
+
+
+def _read_lens(packet: str, value: Callable[[str], float | None], facts: Facts) -> None:
+    """DJI's DewarpData, "date;fx,fy,cx,cy,k1,k2,p1,p2,k3" in pixels of the full image, cx and cy from its middle.
+
+    Images that the camera has straightened itself have another lens, of which nothing is told.
+    """
+    found = re.search(r'drone-dji:DewarpData\s*(?:=\s*["\']|>)\s*[^;"\'<]*;([^"\'<]*)', packet)
+    if found is None or value("DewarpFlag") == 1:
+        return
+    numbers = [number(part) for part in found.group(1).split(",")]
+    middle = value("CalibratedOpticalCenterX"), value("CalibratedOpticalCenterY")
+    width, height = (2 * m if m else side for m, side in zip(middle, (facts.width, facts.height), strict=True))
+    if len(numbers) < 9 or any(n is None for n in numbers[:9]):
+        facts.notes.append("unreadable DewarpData")
+        return
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(n or 0) for n in numbers[:9])
+    if fx <= 0 or fy <= 0 or abs(width * facts.height / (height * facts.width) - 1) > SHAPE:
+        return  # zeros of a camera that was never calibrated, or a part of the image
+    lens = Camera(round(width), round(height), fx, fy, width / 2 + cx, height / 2 + cy, k1, k2, p1, p2, k3)
+    if invertible(lens):
+        facts.lens = lens.resized(facts.width, facts.height)
+    else:
+        facts.notes.append("unreadable DewarpData")
 
 
 def exif_bytes(

@@ -41,6 +41,7 @@ class Frame:
         width, height: pixels as stored.
         camera: calibrated camera, if the folder holds one.
         calibration: camera that was calibrated before and that an estimation of poses keeps.
+        lens: camera that the file tells with its distortion (DJI's DewarpData): where a calibration starts.
         world_from_camera: [4, 4], if the folder holds it.
         gps: from geo.txt, else EXIF.
         relative_altitude: metres above the place of take-off (XMP).
@@ -57,6 +58,7 @@ class Frame:
     height: int
     camera: Camera | None = None
     calibration: Camera | None = None
+    lens: Camera | None = None
     world_from_camera: Array | None = None
     gps: Gps | None = None
     relative_altitude: float | None = None
@@ -72,21 +74,26 @@ class Frame:
     @property
     def camera_key(self) -> Hashable:
         """Frames with equal keys were taken by the same camera at the same settings and may share a calibration."""
-        lens = (self.focal_mm, self.focal35_mm, self.camera)
-        kept = () if self.calibration is None else (self.calibration,)
-        return (self.make, self.model, self.width, self.height, *lens, *kept)
+        known = (self.focal_mm, self.focal35_mm, self.camera)
+        lens = () if self.known_lens is None else (self.calibration, self.lens)
+        return (self.make, self.model, self.width, self.height, *known, *lens)
+
+    @property
+    def known_lens(self) -> Camera | None:
+        """The camera that is known before any is estimated: the calibration, else the lens that the file tells."""
+        return self.calibration or self.lens
 
     @property
     def pinhole(self) -> Camera | None:
-        """The camera without distortion, centred and with one focal length, that stands for the calibration."""
-        if (lens := self.calibration) is None:
+        """The camera without distortion, centred and with one focal length, that stands for the one that is told."""
+        if (lens := self.known_lens) is None:
             return None
         focal = float(np.sqrt(lens.fx * lens.fy))
         return Camera(self.width, self.height, focal, focal, self.width / 2, self.height / 2)
 
     def straight(self, pixels: NDArray) -> Array:
-        """Pixels [..., 2] of the image as its :attr:`pinhole` would show them; as they are without a calibration."""
-        pinhole, lens = self.pinhole, self.calibration
+        """Pixels [..., 2] of the image as its :attr:`pinhole` would show them; as they are where nothing is told."""
+        pinhole, lens = self.pinhole, self.known_lens
         if pinhole is None or lens is None:
             return np.asarray(pixels)
         return rays(pixels, lens)[..., :2] * pinhole.fx + [pinhole.cx, pinhole.cy]

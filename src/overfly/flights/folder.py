@@ -145,6 +145,7 @@ def _read_frames(root: Path, folder: Path, paths: list[Path]) -> tuple[list[Fram
                 focal_mm=found.focal_mm,
                 focal35_mm=found.focal35_mm,
                 focal_px=found.focal_px,
+                lens=found.lens,
                 orientation=found.orientation,
             )
         )

@@ -50,7 +50,7 @@ class Held:
         pixel_sigma: standard deviation of a ray [k], pixels.
         places, place_sigmas: GPS positions of the images [n, 3] and their standard deviations, metres.
         ups: the vertical in camera axes [n, 3], unit length, with ``up_sigma`` in radians.
-        focals: focal lengths by the photos' data [c], pixels, with ``focal_sigma`` as a share.
+        focals: focal lengths by the photos' data [c], pixels, with ``focal_sigma`` as a share [c], or of all.
         lens_sigma: standard deviation of k1 and k2 about zero.
         lens_fixed: cameras that keep their calibration [c].
         knows: coordinates of points [m, 3], such as controls, and ``know_sigmas``, metres.
@@ -67,7 +67,7 @@ class Held:
     knows: Array
     know_sigmas: Array
     up_sigma: float = UP_SIGMA
-    focal_sigma: float = 0.02
+    focal_sigma: Array | float = 0.02
     lens_sigma: float = LENS_SIGMA
     lever: bool = False
     datum: bool = False
@@ -240,7 +240,8 @@ def _rows(state: Adjusted) -> Rows:
                 rows.add(0.0, [column + i], [1 / FIXED])
             continue
         if np.isfinite(held.focals[j]):
-            rows.add(np.log(b.lenses[j, 0] / held.focals[j]) / held.focal_sigma, [column], [1 / held.focal_sigma])
+            sigma = float(np.broadcast_to(held.focal_sigma, c)[j])
+            rows.add(np.log(b.lenses[j, 0] / held.focals[j]) / sigma, [column], [1 / sigma])
         for i in range(2):
             rows.add(b.lenses[j, 3 + i] / held.lens_sigma, [column + 1 + i], [1 / held.lens_sigma])
     for i in range(3):

@@ -11,11 +11,11 @@ import numpy as np
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
-from overfly.geometry import Array
+from overfly.geometry import Array, Camera
 from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
 from overfly.mapping.bundle import Bundle
-from overfly.mapping.calibration import FOCAL_TRIED, adjusted_twice, calibrated, held_by_images
+from overfly.mapping.calibration import FOCAL_TRIED, adjusted_twice, calibrated, composed, held_by_images
 from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, strongest_pair
@@ -222,7 +222,7 @@ def _block(
     known = [
         replace(
             frames[i],
-            camera=frames[i].calibration or bundle.camera(k, frames[i].width, frames[i].height),
+            camera=_camera(frames[i], bundle.camera(k, frames[i].width, frames[i].height)),
             world_from_camera=bundle.pose(k),
         )
         for k, i in enumerate(bundle.frames.tolist())
@@ -248,6 +248,13 @@ def _block(
         held_by_gps=apart,
         warnings=warnings,
     )
+
+
+def _camera(frame: Frame, found: Camera) -> Camera:
+    """The camera of an image as it is stored, of the one that was found with straightened pixels."""
+    if frame.calibration is not None or frame.lens is None:
+        return frame.calibration or found
+    return composed(frame.lens, found)
 
 
 def precision_of(result: Adjusted) -> Precision:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from overfly.flights import Frame
-from overfly.geometry import Array
+from overfly.geometry import Array, Camera, distort, pixel_grid, rays, undistort
 from overfly.mapping.adjustment import LENS_SIGMA, Adjusted, Held, adjusted, free
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.database import focal_px
@@ -25,8 +25,9 @@ WORST_PX = 3.0
 FOCAL_TRIED, TRIED_SIGMA = 0.05, 1e-4
 """Share by which a focal length is made longer, to see whether the images notice; and how firmly that is held."""
 
-FOCAL_SIGMA = 0.02
-"""Standard deviation of a focal length by the photo's own data, as a share."""
+FOCAL_SIGMA, CALIBRATED_SIGMA = 0.02, 0.005
+"""Standard deviation of a focal length by the photo's own data, as a share: by the data sheet, and by the maker's
+calibration of this very camera, which temperature moves."""
 
 FEWEST_TO_FREE = 8
 """Images of a camera from which on its focal length may be another than the photos' data tell: two lines of four."""
@@ -46,6 +47,9 @@ LOOSE = 10.0
 HOPELESS, PATIENCE = 20, 5
 """Steps that gain less than this part of what must be gained in all are the last ones after so many of them."""
 
+FITTED = 24
+"""Points along each side of an image by which the terms of two lenses are made one."""
+
 ROUGHLY = 1.0
 """What a step must still gain before the decisions; the last adjustment goes on to the end."""
 
@@ -59,7 +63,7 @@ def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
     return replace(
         free(bundle, NOISE_PX * _shrunk(bundle, frames)),
         focals=np.array(focals, float),
-        focal_sigma=FOCAL_SIGMA,
+        focal_sigma=np.array([FOCAL_SIGMA if own[i].lens is None else CALIBRATED_SIGMA for i in first]),
         lens_sigma=NO_LENS_SIGMA,
         lens_fixed=(count < FEWEST_TO_CALIBRATE) | [own[i].calibration is not None for i in first],
     )
@@ -112,7 +116,7 @@ def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
     if (told & ~result.held.lens_fixed).any():
         hopeless = needed / HOPELESS
         focals = np.where(told, result.bundle.lenses[:, 0] * (1 + FOCAL_TRIED), np.nan)
-        longer = replace(result.held, focals=focals, focal_sigma=TRIED_SIGMA)
+        longer = replace(result.held, focals=focals, focal_sigma=np.full(len(focals), TRIED_SIGMA))
         tried = adjusted(result.bundle, longer, lever=start, tolerance=hopeless, patience=PATIENCE)
         untold = tried.cost - result.cost < needed
         rays = np.median(np.bincount(result.bundle.image, minlength=len(result.bundle)))
@@ -122,3 +126,33 @@ def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
             if result.cost - focal.cost > needed:
                 result, untold = focal, False
     return adjusted(result.bundle, result.held, lever=result.lever), untold
+
+
+def composed(lens: Camera, straightened: Camera) -> Camera:
+    """The camera of an image whose straightened pixels (:meth:`overfly.flights.Frame.straight`) were calibrated.
+
+    Args:
+        lens: that the pixels were straightened by.
+        straightened: found with these: another focal length than its pinhole's, and radial terms on top.
+    """
+    from scipy.optimize import least_squares
+
+    if not straightened.is_distorted and straightened.fx == np.sqrt(lens.fx * lens.fy):
+        return lens
+    seen = rays(pixel_grid(FITTED, FITTED) / FITTED * [lens.width, lens.height], lens)[..., :2].reshape(-1, 2)
+    # What points the straightened camera sees where the lens alone would see these.
+    points = undistort(seen * (np.sqrt(lens.fx * lens.fy) / straightened.fx), straightened)
+    target = distort(seen, lens) * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+    points, target = (values[np.isfinite(points).all(1)] for values in (points, target))
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    scale = np.array([lens.fx, lens.fy, lens.fx, lens.fy, 1, 1, 1, 1, 1])
+
+    def camera(x: Array) -> Camera:
+        return replace(lens, **dict(zip(names, (x * scale).tolist(), strict=True)))
+
+    def misses(x: Array) -> Array:
+        c = camera(x)
+        return np.asarray(distort(points, c) * [c.fx, c.fy] + [c.cx, c.cy] - target).ravel()
+
+    start = np.array([getattr(lens, name) for name in names]) / scale
+    return camera(least_squares(misses, start, method="lm", xtol=1e-12, ftol=1e-12).x)
