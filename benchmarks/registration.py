@@ -32,6 +32,7 @@ from overfly.preflight.check import check_flight
 from overfly.preflight.ground import place
 from overfly.preflight.images import Look, look_at_all
 from overfly.preflight.positions import position_findings
+from overfly.shipped import load_network
 from overfly.tables import markdown
 
 STYLES = ("campus", "blocks", "suburb", "industrial", "village", "vegetation")
@@ -107,7 +108,12 @@ def outcome(out: Path, number: int) -> dict[str, Any]:
         count = len(list((folder / "photos").iterdir()))
         try:
             _, block = align_flight(
-                folder / "photos", out=folder / "map", cameras="estimate", dense="stereo", progress=False
+                folder / "photos",
+                out=folder / "map",
+                cameras="estimate",
+                network=load_network,
+                network_name="shipped",
+                progress=False,
             )
             row |= {"images": count, "placed": (len(block.frames) - len(block.held_by_gps)) / count, "why": ""}
         except InputError as error:

@@ -47,7 +47,7 @@ def test_usable_is_what_is_textured_lit_and_sharp():
 def test_an_image_without_a_position_overlaps_as_the_others_do():
     names = ["a", "b", "c", "d"]
     assert placed_chances(names, np.ones(4), ["a", "b", "d"], line(3)).min() > 0.99
-    assert placed_chances(names, np.array([1, 1, 0.01, 1]), ["a", "b", "d"], line(3))[2] < 0.02
+    assert placed_chances(names, np.array([1, 1, 0.01, 1]), ["a", "b", "d"], line(3))[2] < 0.05
     assert placed_chances(names, np.ones(4), [], None).min() > 0.99
 
 
