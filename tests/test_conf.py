@@ -128,6 +128,9 @@ def test_trainer_flags_that_people_use_need_no_plus() -> None:
         ("side_overlap=-1", "0 to 95"),
         ("frames=0", "1 to 8"),
         ("altitude=true", "20 to 500"),
+        ("image_size=[256]", "width and height"),
+        ("image_size=[64,64,3]", "width and height"),
+        ("+stge=gan", "Did you mean stage"),
     ],
 )
 def test_values_that_no_flight_can_have_are_refused(override: str, allowed: str) -> None:
@@ -148,7 +151,8 @@ def test_unknown_style_is_named_with_the_nearest() -> None:
     ("override", "says"),
     [
         ("overlap=120", "overlap=120 is not possible: give percent, a number from 0 to 95"),
-        ("overlop=50", "overlop"),
+        ("overlop=50", "There is no key 'overlop'. Did you mean overlap?"),
+        ("data=folder", "data.root has no value: give data.root=VALUE"),
         ("stage=gam", "gan"),
         ("data.source.styles=[vilage]", "did you mean 'village'"),
         ("resume=nowhere", "resume=nowhere is not a run folder"),

@@ -6,6 +6,7 @@ Beside :mod:`overfly.run` and the summary of sweeps the only module that knows H
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ def check(cfg: DictConfig) -> None:
     """Refuse values that no flight can have.
 
     Raises:
-        InputError: ``altitude``, ``overlap`` or ``side_overlap`` is no number or out of bounds.
+        InputError: ``altitude``, ``overlap`` or ``side_overlap`` is no number or out of bounds; ``frames`` or
+            ``image_size`` is not possible; a key that no file of the tree knows.
     """
     for key, (low, high) in BOUNDS.items():
         values = cfg[key] if OmegaConf.is_list(cfg[key]) else [cfg[key]]
@@ -55,8 +57,31 @@ def check(cfg: DictConfig) -> None:
                     f"{key}={value} is not possible: give {UNITS[key]}, a number from {low} to {high} "
                     f"(or a list of them), for instance {key}={(low + high) // 2}."
                 )
+    unknown_keys = sorted(set(map(str, cfg)) - _top_keys())
+    if unknown_keys:
+        raise InputError(_no_key(unknown_keys[0]))
+    size = OmegaConf.to_container(cfg.image_size) if OmegaConf.is_list(cfg.image_size) else cfg.image_size
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(x, int) and x > 0 for x in size)):
+        raise InputError(f"image_size={size} is not possible: give width and height in pixels, image_size=[128,96].")
     if not isinstance(cfg.frames, int) or not 1 <= cfg.frames <= 8:
         raise InputError(f"frames={cfg.frames} is not possible: a window has 1 to 8 frames, for instance frames=3.")
+
+
+def _top_keys() -> set[str]:
+    """Every key that may stand at the top: of the primary file, of files that are laid over all, and the groups."""
+    keys = {path.name for path in conf_dir().iterdir() if path.is_dir()}
+    for path in conf_dir().rglob("*.yaml"):
+        if path.parent == conf_dir() or path.read_text().startswith("# @package _global_"):
+            keys |= {str(key) for key in OmegaConf.load(path)}
+    return keys - {"defaults"}
+
+
+def _no_key(key: str) -> str:
+    from difflib import get_close_matches
+
+    near = get_close_matches(key, _top_keys(), 1)
+    meant = f" Did you mean {near[0]}?" if near else ""
+    return f"There is no key {key!r}.{meant} Type `python train.py --cfg job` to see every key."
 
 
 def build(cfg: Any) -> Any:
@@ -97,8 +122,13 @@ def explain(error: BaseException) -> str | None:
         if isinstance(link, InputError):
             return str(link)
     text = " ".join(" ".join(str(link).split()) for link in chain[:2])
+    text = text.split(" Config search path:")[0]
     if isinstance(error, MissingConfigException):
         return text
+    if (found := re.search(r"Could not override '([^']+)'", text)) and "." not in found[1]:
+        return _no_key(found[1])
+    if found := re.search(r"Missing mandatory value: (\S+)", text):
+        return f"{found[1]} has no value: give {found[1]}=VALUE on the command line."
     if isinstance(error, ConfigCompositionException | OmegaConfBaseException):
         return f"The configuration refuses this: {text}. Type `python train.py --cfg job` to see every key."
     return None

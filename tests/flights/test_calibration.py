@@ -100,6 +100,13 @@ def test_a_file_without_a_usable_camera_is_refused(tmp_path: Path, text: str, se
 
 
 def test_nothing_there_is_said(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "absent.json"):
-        with pytest.raises(InputError, match="holds no cameras"):
+    for path, sentence in (
+        (written(tmp_path / "empty" / "notes.txt", "").parent, "holds no cameras"),
+        (tmp_path / "absent.json", "does not exist"),
+        (written(tmp_path / "cloud.laz", "LASF"), "is no file of cameras"),
+        (written(tmp_path / "map.json", '{"seconds": {"dense": 1.0}, "images": 9}'), "holds no camera"),
+        (written(tmp_path / "cameras.txt", "1 SIMPLE_RADIAL 480 320 -100 240 160 0\n"), "focal length -100"),
+    ):
+        with pytest.raises(InputError, match=sentence) as told:
             read_calibration(path)
+        assert "-100" in str(told.value) or "cameras.txt or .bin" in str(told.value)

@@ -69,6 +69,17 @@ def test_all_frames_are_placed_where_they_were(block, strips, camera) -> None:  
     assert block.cameras[0].fx == pytest.approx(camera.fx, rel=0.02)
 
 
+def test_a_position_that_is_far_off_does_not_make_all_of_them_look_bad(block) -> None:  # type: ignore[no-untyped-def]
+    before = block.gps_rms()
+    assert block.gps_far_off() == []
+    gps = block.frames[2].gps
+    frames = list(block.frames)
+    frames[2] = replace(frames[2], gps=replace(gps, latitude=gps.latitude + 0.005))  # 560 m
+    wrong = replace(block, frames=frames)
+    assert wrong.gps_far_off() == [frames[2].name]
+    assert wrong.gps_rms()["horizontal_m"] == pytest.approx(before["horizontal_m"], abs=0.1)
+
+
 def test_gps_makes_it_metres_east_north_up(block, strips, hill) -> None:  # type: ignore[no-untyped-def]
     assert block.metric
     rms = block.gps_rms()

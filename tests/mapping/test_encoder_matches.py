@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from overfly.geometry import fit_similarity, project, transform
 from overfly.losses import correspondence
 from overfly.mapping.align import align, gps_frame
 from overfly.mapping.correlate import refine
-from overfly.mapping.encoder_matches import Prior, match_pair, overlay, picture
+from overfly.mapping.encoder_matches import Prior, apart, match_pair, overlay, picture
 from overfly.mapping.matches import encoder_matches, priors
 from overfly.mapping.settings import MapSettings
 from overfly.networks.encoder import Encoder
@@ -134,6 +135,43 @@ def test_a_key_point_keeps_its_place_in_all_pairs(hill, camera, strips, encoder,
     for (i, j), rows in matches.items():
         assert rows[:, 0].max() < len(pixels[i])
         assert rows[:, 1].max() < len(pixels[j])
+
+
+def test_priors_tell_which_pictures_lie_apart(camera, strips) -> None:  # type: ignore[no-untyped-def]
+    def moved(metres: float) -> Prior:
+        pose = strips[0].copy()
+        pose[0, 3] += metres
+        return Prior(camera, pose)
+
+    here = Prior(camera, strips[0])  # 80 m wide on the ground
+    assert [apart(here, moved(x)) for x in (0, 60, 90, 130, 400)] == [False, False, False, True, True]
+    assert not apart(None, moved(400))
+    assert not apart(here, None)
+    level = strips[0].copy()
+    level[:3, :3] = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # the horizon is in the picture
+    assert not apart(here, Prior(camera, level))
+
+
+def test_where_priors_are_right_no_turns_are_tried(  # type: ignore[no-untyped-def]
+    hill, camera, strips, encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("overfly.mapping.matches.TRUSTED", 1)
+    asked: list[int | None] = []
+
+    def counted(*arguments: Any) -> Any:
+        asked.append(None if len(arguments) < 4 else len(arguments[3]))
+        return overlay(*arguments)
+
+    monkeypatch.setattr("overfly.mapping.matches.overlay", counted)
+    frames = hill.frames(tmp_path, camera, strips[:3], known=False)
+    cv2.imwrite(str(frames[2].path), np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8))
+    given = [Prior(camera, pose) for pose in strips[:3]]
+    _, matches = encoder_matches(frames, [(0, 1), (1, 2)], encoder, priors=given, progress=lambda done, total: None)
+    assert list(matches) == [(0, 1)]
+    assert asked == [1, 1]  # the ground plane alone, in both pairs
+    asked.clear()
+    encoder_matches(frames, [(1, 2)], encoder, priors=given, progress=lambda done, total: None)
+    assert asked == [1, None]  # not trusted yet: turns are tried as well
 
 
 @pytest.mark.parametrize("matcher", ["encoder", "both"])

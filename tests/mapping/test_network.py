@@ -101,12 +101,13 @@ def test_true_points_land_where_they_are_and_a_ten_metre_cube_stays_ten_metres()
     assert (size > 7).all()
 
 
-def test_views_are_counted_and_lonely_points_are_predicted() -> None:
+def test_views_are_counted_and_no_point_counts_as_measured() -> None:
+    """A network that learns landscapes by heart may be right where several frames see a place, but nobody measured."""
     views = flight(2, step=60.0)  # little overlap
     cloud = network_cloud(views, Run(Truth(views, 100.0)), ground_height=100.0)
     assert cloud.views is not None
     assert cloud.predicted is not None
-    np.testing.assert_array_equal(cloud.predicted, cloud.views < 2)
+    assert cloud.predicted.all()
     inside = np.zeros(len(cloud), int)
     for view in views:
         assert view.camera is not None
@@ -115,7 +116,7 @@ def test_views_are_counted_and_lonely_points_are_predicted() -> None:
         inside += ((uv >= 0) & (uv < [200, 150])).all(-1)
     assert (cloud.views <= inside).all()  # occlusion may only take away
     assert (cloud.views == inside).mean() > 0.97
-    assert 0.2 < cloud.predicted.mean() < 0.95
+    assert 0.2 < (cloud.views < 2).mean() < 0.95
 
 
 def test_colours_come_from_the_reference_frame() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 
@@ -54,6 +55,22 @@ def test_identical_clouds_are_perfect() -> None:
     assert result["fscore"]["0.25"] == result["completeness_1m"] == 1
 
 
+def test_what_sampling_alone_makes_of_the_1024_points_is_told() -> None:
+    """A cloud that is the reference has an EMD above 0: both are drawn anew."""
+    result = evaluate(Cloud(surface(6000)), Cloud(surface(6000)), voxel_m=0)
+    assert 0 < result["emd_m"] == pytest.approx(result["emd_floor_m"], rel=0.3)
+    assert 0 < result["chamfer_sum_1024"] == pytest.approx(result["chamfer_sum_1024_floor"], rel=0.3)
+    console = Console(width=150, record=True, file=io.StringIO())
+    console.print(format_table(result))
+    assert f"{result['emd_floor_m']:.3f}" in console.export_text()
+
+
+def test_a_reference_sparser_than_the_thresholds_is_warned_of() -> None:
+    sparse, dense = Cloud(surface(2000)), Cloud(surface(200_000))
+    assert any("0.37 m apart" in warning and "denser" in warning for warning in evaluate(dense, sparse)["warnings"])
+    assert not any("denser" in warning for warning in evaluate(sparse, dense)["warnings"])
+
+
 def test_voxels_even_out_density_and_clip_drops_what_the_reference_cannot_judge() -> None:
     reference = surface(8000, 2)
     dense_spot = np.tile(surface(1, 3), (5000, 1)) + np.array([0, 0, 9.0])
@@ -102,7 +119,7 @@ def test_frames() -> None:
 
 def test_heights_that_refer_to_different_things_are_told_refused_or_laid_upon_each_other() -> None:
     plain, sea, other = (
-        Cloud(surface(3000) + UTM, epsg=32615, vertical_epsg=vertical) for vertical in (None, 5773, 3855)
+        Cloud(surface(9000) + UTM, epsg=32615, vertical_epsg=vertical) for vertical in (None, 5773, 3855)
     )
     same = evaluate(sea, sea)
     assert (same["epsg"], same["vertical_epsg"], same["warnings"]) == (32615, 5773, [])

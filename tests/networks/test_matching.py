@@ -6,7 +6,15 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from overfly.networks.matching import cell_pixels, keypoints, match, nearest, sample_depth, true_correspondences
+from overfly.networks.matching import (
+    cell_pixels,
+    keypoints,
+    match,
+    nearest,
+    nearest_around,
+    sample_depth,
+    true_correspondences,
+)
 from terrain import make_batch
 
 
@@ -67,6 +75,20 @@ def test_nearest_finds_a_planted_place_below_the_cell() -> None:
     found, score = nearest(torch.tensor([[[0.0, 1.0]]]), torch.stack([angle.cos(), angle.sin()], 1))
     assert torch.allclose(found[0, 0], at * 2, atol=0.3)
     assert score[0, 0] > 0.9
+
+
+def test_a_search_around_a_place_finds_what_the_whole_search_finds_there_and_nothing_farther() -> None:
+    generator = torch.Generator().manual_seed(0)
+    whole = F.normalize(torch.randn(16, 70, 90, generator=generator), dim=0)
+    cells = torch.tensor([3, 95, 2040, 3100, 6299])
+    queries, truth = whole.flatten(1).T[cells], cell_pixels(70, 90)[cells]
+    everywhere = nearest(queries[None], whole[None])[0][0]
+    near, score = nearest_around(queries, whole, truth + torch.tensor([7.0, -5.0]), reach=12)
+    assert torch.allclose(near, everywhere, atol=0.6)  # parabolas may end at a window's border
+    assert torch.allclose(score, torch.ones(5), atol=1e-5)
+    far, score = nearest_around(queries[2:3], whole, truth[2:3] + torch.tensor([[-80.0, 40.0]]), reach=4)
+    assert (far - truth[2]).abs().max() > 20
+    assert score[0] < 0.99
 
 
 def test_match_recovers_a_shift() -> None:

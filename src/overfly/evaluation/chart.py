@@ -32,11 +32,12 @@ def draw(rows: Sequence[Row], path: Path, *, networks: Sequence[str]) -> None:
     rows = [row for row in rows if not row["cloud"].startswith("floor")]
     groups = [g for g in dict.fromkeys(row["styles"] for row in rows) if g != ALL] or [ALL]
     names = list(dict.fromkeys(row["cloud"] for row in rows))
-    figure = Figure(figsize=(12, 2.6 * len(groups) * len(LINES) + 0.8), layout="constrained")
-    axes = figure.subplots(len(groups) * len(LINES), len(AXES), squeeze=False, sharey="row")
+    several = [axis for axis in AXES if len({row[axis] for row in rows} - {ALL}) > 1] or list(AXES[:1])
+    figure = Figure(figsize=(4 * len(several), 2.6 * len(groups) * len(LINES) + 0.8), layout="constrained")
+    axes = figure.subplots(len(groups) * len(LINES), len(several), squeeze=False, sharey="row")
     panels = [(metric, title, group) for metric, title in LINES for group in groups]
     for line, (metric, title, group) in enumerate(panels):
-        for column, axis_name in enumerate(AXES):
+        for column, axis_name in enumerate(several):
             axis = axes[line][column]
             places = _places(rows, group, axis_name)
             for number, name in enumerate(names):
@@ -63,7 +64,9 @@ def draw(rows: Sequence[Row], path: Path, *, networks: Sequence[str]) -> None:
     shown = {label: line for row in axes for a in row for line, label in zip(*a.get_legend_handles_labels())}
     ordered = [name for name in names if name in shown]
     if ordered:
-        figure.legend([shown[n] for n in ordered], ordered, loc="outside lower center", ncols=4, frameon=False)
+        figure.legend(
+            [shown[n] for n in ordered], ordered, loc="outside lower center", ncols=1 + len(several), frameon=False
+        )
     figure.savefig(path, dpi=110)
 
 

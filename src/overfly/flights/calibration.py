@@ -31,6 +31,15 @@ FILES = (
 """Where a folder may hold cameras, in the order in which they are looked for."""
 
 
+UNTOLD = "The images do not tell the focal length"
+"""How the warning of a map begins whose camera is not known well."""
+
+ALLOWED = (
+    "Give the folder of a map or flight, a transforms.json, COLMAP's cameras.txt or .bin, OpenSfM's "
+    "reconstruction.json or the cameras.json of ODM."
+)
+
+
 def read_calibration(path: Path | str) -> list[Camera]:
     """The different cameras in a file, or in a folder with one of :data:`FILES`: a map, a flight or a COLMAP model.
 
@@ -41,16 +50,17 @@ def read_calibration(path: Path | str) -> list[Camera]:
         InputError: there is no such file, or it holds no camera that can be used.
     """
     asked = Path(path)
+    if not asked.exists():
+        raise InputError(f"--calibration {asked} does not exist: check the path. {ALLOWED}")
     file = next((asked / name for name in FILES if (asked / name).is_file()), None) if asked.is_dir() else asked
     if file is None or not file.is_file():
-        raise InputError(
-            f"--calibration {asked} holds no cameras: give the folder of a map or flight, a transforms.json, COLMAP's "
-            "cameras.txt or .bin, or the cameras.json of ODM."
-        )
+        raise InputError(f"--calibration {asked} holds no cameras. {ALLOWED}")
+    if file.suffix not in (".txt", ".bin", ".json"):
+        raise InputError(f"--calibration {asked} is no file of cameras. {ALLOWED}")
     found = list(read_colmap_cameras(file).values()) if file.suffix in (".txt", ".bin") else _of_json(file)
     cameras = list(dict.fromkeys(found))
     if not cameras:
-        raise InputError(f"{file} holds no camera: export it again, or give another file by --calibration.")
+        raise InputError(f"{file} holds no camera. {ALLOWED}")
     for camera in cameras:
         _check_lens(camera, file)
     return cameras
@@ -63,6 +73,23 @@ def with_calibration(flight: Flight, cameras: list[Camera], source: str) -> Flig
         InputError: none or several of the cameras have the shape of an image.
     """
     return replace(flight, frames=[replace(f, calibration=_fitting(f, cameras, source)) for f in flight.frames])
+
+
+def source_remarks(path: Path | str) -> list[str]:
+    """What the map said that a calibration comes from: whether its images told the focal length."""
+    told = Path(path) / "map.json"
+    if not told.is_file():
+        return []
+    try:
+        said = [str(text) for text in json.loads(told.read_text(encoding="utf-8")).get("warnings", [])]
+    except (ValueError, AttributeError):
+        return []
+    if not any(text.startswith(UNTOLD) for text in said):
+        return []
+    return [
+        f"The calibration of {path} is kept, but that map's images did not tell its focal length well: differences in "
+        "height may be wrong by as much as there. Calibrate from another height, over relief, or with ground control."
+    ]
 
 
 def _fitting(frame: Frame, cameras: list[Camera], source: str) -> Camera:
@@ -107,7 +134,8 @@ def _of_json(file: Path) -> list[Camera]:
 
 
 def _opensfm(cameras: Mapping[str, Any], file: Path) -> list[Camera]:
-    return [opensfm_camera(key, values, file) for key, values in cameras.items() if isinstance(values, dict)]
+    known = {key: values for key, values in cameras.items() if isinstance(values, dict) and "width" in values}
+    return [opensfm_camera(key, values, file) for key, values in known.items()]
 
 
 def _check_lens(camera: Camera, file: Path) -> None:

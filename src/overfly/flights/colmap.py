@@ -83,6 +83,10 @@ def _camera(model: str, width: int, height: int, parameters: list[float], path: 
         raise InputError(f"{path}: FULL_OPENCV with k4, k5, k6 is not supported: undistort the images with COLMAP.")
     if "f" in values:
         values["fx"] = values["fy"] = values.pop("f")
+    if min(values["fx"], values["fy"], width, height) <= 0:
+        raise InputError(
+            f"{path}: a camera has the focal length {values['fx']:g} at {width} x {height}: give pixels > 0."
+        )
     return Camera(width, height, **values)
 
 

@@ -40,8 +40,6 @@ class Frame:
         path: the image file.
         width, height: pixels as stored.
         camera: calibrated camera, if the folder holds one.
-        calibration: camera that was calibrated before and that an estimation of poses keeps.
-        lens: camera that the file tells with its distortion (DJI's DewarpData): where a calibration starts.
         world_from_camera: [4, 4], if the folder holds it.
         gps: from geo.txt, else EXIF.
         relative_altitude: metres above the place of take-off (XMP).
@@ -50,6 +48,8 @@ class Frame:
         focal_mm, focal35_mm: focal length, and the one with the same field of view on 36 x 24 mm film.
         focal_px: focal length in pixels from the EXIF focal-plane tags.
         orientation: the EXIF tag; pixels are always used as stored, so it is never applied.
+        calibration: camera that was calibrated before and that an estimation of poses keeps.
+        lens: camera that the file tells with its distortion (DJI's DewarpData): where a calibration starts.
     """
 
     name: str
@@ -57,8 +57,6 @@ class Frame:
     width: int
     height: int
     camera: Camera | None = None
-    calibration: Camera | None = None
-    lens: Camera | None = None
     world_from_camera: Array | None = None
     gps: Gps | None = None
     relative_altitude: float | None = None
@@ -70,6 +68,8 @@ class Frame:
     focal35_mm: float | None = None
     focal_px: float | None = None
     orientation: int = 1
+    calibration: Camera | None = None
+    lens: Camera | None = None
 
     @property
     def camera_key(self) -> Hashable:

@@ -34,6 +34,9 @@ DEFAULT_STRIPS = 5
 SCENE_SIZE_M = (200.0, 4000.0)
 RECORD = "fly.json"
 
+REFERENCE = (500_000, 2_000_000)
+"""Fewest and most points of reference.laz, where their number is not given."""
+
 
 def default_area(
     flight_path: str, camera: Camera, altitude: float, overlap: float, side_overlap: float, tilt_deg: float
@@ -70,7 +73,7 @@ def fly(
     appearance: Appearance | None = None,
     origin: Origin | None = None,
     supersample: int = 2,
-    reference_points: int = 500_000,
+    reference_points: int | None = None,
     processes: int = 1,
     quality: int = 95,
 ) -> tuple[Plan, list[Frame]]:
@@ -86,7 +89,8 @@ def fly(
         seed: of the scene's style, the random path, and all noise.
         noise: of the GPS and gimbal values in the images' metadata; transforms.json always holds the true cameras.
         origin: where the local frame stands; None takes the scene's own, else 46 N 8 E.
-        reference_points: size of reference.laz, 0 for none.
+        reference_points: size of reference.laz, 0 for none; None: one for each ground pixel of the area that is seen,
+            within :data:`REFERENCE`.
         processes: that render.
 
     Returns:
@@ -137,6 +141,8 @@ def fly(
         "ground_height": plan.ground_height,
         "noise": asdict(model),
     }
+    if reference_points is None:
+        reference_points = int(np.clip(_ground_pixels(scene, plan), *REFERENCE))
     settings = [supersample, quality, reference_points, repr(appearance), asdict(origin)]
     for remark in remarks(scene, plan):
         sys.stderr.write(f"Note: {remark}\n")
@@ -151,6 +157,15 @@ def fly(
         write_reference(scene, plan, out, reference_points, seed)
     write_transforms(out / "transforms.json", written, origin, facts)
     return plan, written
+
+
+def _ground_pixels(scene: Scene, plan: Plan) -> float:
+    """Area that the frames see, in pixels on level ground."""
+    import shapely
+
+    site = Site(plan.camera, scene.ground, plan.area, plan.altitude, plan.tilt_deg, False)
+    area = shapely.union_all(polygons(site.outlines(plan.world_from_camera))).area
+    return float(area / (plan.altitude / plan.camera.fx) ** 2)
 
 
 def _scene_size(flight_path: str, extent: tuple[float, float], seed: int, options: dict[str, Any]) -> float:

@@ -76,6 +76,8 @@ def opensfm_camera(key: str, values: dict[str, Any], path: Path) -> Camera:
         lens = {k: float(values.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2", "k3")}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"Camera {key!r} of {path} is broken ({error!r}): export the file again.") from error
+    if min(fx, fy, width, height) <= 0:
+        raise InputError(f"Camera {key!r} of {path} has the focal length {fx:g} at {width} x {height}: give both > 0.")
     camera = Camera(width, height, fx * size, fy * size, cx * size + width / 2, cy * size + height / 2, **lens)
     if not np.isfinite(list(camera.to_dict().values())).all():
         raise InputError(f"Camera {key!r} of {path} holds NaN or infinity: export the file again.")

@@ -128,7 +128,9 @@ def transforms_camera(values: dict[str, Any], image: Path | None, where: str) ->
     focal = values.get("fl_x")
     if focal is None and values.get("camera_angle_x"):
         focal = w / 2 / math.tan(values["camera_angle_x"] / 2)
-    if focal is None or focal <= 0 or w <= 0 or h <= 0:
+    if (focal is not None and focal <= 0) or w <= 0 or h <= 0:
+        raise InputError(f"{where}: the focal length {focal} at {w} x {h} pixels is not possible: give both above 0.")
+    if focal is None:
         raise InputError(f"{where}: no focal length: give fl_x in pixels, at the top of the file or in the frame.")
     lens = {} if model != "OPENCV" else {k: float(values.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2", "k3")}
     fy = values.get("fl_y", focal) if model != "SIMPLE_PINHOLE" else focal

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from overfly.errors import InputError
-from overfly.flights import Flight, Frame
+from overfly.flights import UNTOLD, Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array, Camera
 from overfly.mapping.adjustment import Adjusted
@@ -173,7 +173,7 @@ def _held_block(
         result = replace(result, bundle=bundle.moved(lift))
     if untold and not (ruled is not None and ruled.used):
         warnings.append(
-            f"The images do not tell the focal length: one that is {100 * FOCAL_TRIED:.0f} % longer would explain them "
+            f"{UNTOLD}: one that is {100 * FOCAL_TRIED:.0f} % longer would explain them "
             "as well. Differences in height may be wrong by as much: use ground control, add images from another "
             "height, or give a calibrated camera by --calibration."
         )
@@ -200,8 +200,14 @@ def _remark_scale(places: Array, sigmas: Array, warnings: list[str]) -> None:
 def _remark_focal(bundle: Bundle, frames: list[Frame], warnings: list[str]) -> None:
     """Say where the images and the photo's own data disagree about the focal length."""
     for j in range(len(bundle.lenses)):
-        prior, found = focal_px(frames[int(np.flatnonzero(bundle.lens_of == j)[0])]), float(bundle.lenses[j, 0])
-        if prior and abs(found / prior - 1) > FOCAL_DRIFT:
+        frame, found = frames[int(np.flatnonzero(bundle.lens_of == j)[0])], float(bundle.lenses[j, 0])
+        prior = focal_px(replace(frame, calibration=None))
+        if prior and frame.calibration is not None and abs(found / prior - 1) > FOCAL_DRIFT:
+            warnings.append(
+                f"The calibration has a focal length of {found:.0f} px, the photos' data say {prior:.0f} px: if it is "
+                "of another camera or zoom, heights are wrong by as much; map without --calibration to compare."
+            )
+        elif prior and abs(found / prior - 1) > FOCAL_DRIFT:
             warnings.append(
                 f"The focal length came out as {found:.0f} px, the photos' data say {prior:.0f} px: heights may be "
                 f"wrong by up to {100 * abs(found / prior - 1):.0f} % where the overlap is weak."
@@ -239,7 +245,7 @@ def _block(
         origin=origin,
         cameras_from="estimated",
         metric=metric,
-        reprojection_px=float(errors[tied].mean()),
+        reprojection_px=float(errors[tied].mean()) if tied.any() else None,
         points=points[beside_others(points, bundle.centres)],
         survey=None if ruled is None else ruled.survey,
         precision=precision_of(result) if metric else Precision(why_not="no GPS and no control gives the block metres"),

@@ -14,6 +14,7 @@ from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array, Camera
+from overfly.mapping.placing import far_off
 from overfly.mapping.survey import Precision, Survey, precision_from, survey_from
 
 
@@ -84,14 +85,24 @@ class Block:
             away -= self.survey.gps_shift_m
         return away
 
+    def gps_far_off(self) -> list[str]:
+        """Names of the frames whose GPS is much further from its camera than that of most."""
+        distance = np.linalg.norm(self.gps_residuals()[:, :2], axis=1)
+        if np.isnan(distance).all():
+            return []
+        with np.errstate(invalid="ignore"):
+            return [self.names[i] for i in np.flatnonzero(far_off(distance)).tolist()]
+
     def gps_rms(self) -> dict[str, float | None] | None:
         """RMS distance of the cameras from their own GPS; None without GPS.
 
-        The antenna and a constant shift in height are taken out, and one in the plane where ground control tells it.
+        The antenna and a constant shift in height are taken out, and one in the plane where ground control tells it;
+        positions that are far off (:meth:`gps_far_off`) do not count.
         """
         away = self.gps_residuals()
         if np.isnan(away[:, :2]).all():
             return None
+        away[[name in self.gps_far_off() for name in self.names]] = np.nan
         rises = away[np.isfinite(away[:, 2]), 2]
         vertical = float(np.sqrt(np.mean((rises - np.median(rises)) ** 2))) if len(rises) else None
         return {

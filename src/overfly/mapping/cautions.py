@@ -47,7 +47,7 @@ def _about_place(summary: Mapping[str, Any], has_gps: bool) -> Iterator[Caution]
             "The map has no place on the Earth: it is in the cameras' own frame and the files carry no CRS.",
             "Give the origin in transforms.json (key overfly.origin) if it should lie in a GIS.",
         )
-    if not has_gps and summary["cameras_from"] == "estimated":
+    if not has_gps and summary["cameras_from"] == "estimated" and not summary["metric"]:
         yield Caution(
             "No image carries a usable GPS position.",
             "Which way is up is guessed from the cameras and north is unknown; look for a tilt in the heights.",
@@ -63,8 +63,8 @@ def _about_images(summary: Mapping[str, Any]) -> Iterator[Caution]:
     if skipped := summary["skipped"]:
         files = "file was" if len(skipped) == 1 else "files were"
         yield Caution(
-            f"{len(skipped)} {files} skipped: {names_text(list(skipped))}.",
-            "The reasons stand below; copy broken files again from the card.",
+            f"{len(skipped)} {files} skipped: {names_text([f'{name} ({why})' for name, why in skipped.items()])}.",
+            "Copy broken files again from the card.",
         )
     if (pixels := summary.get("reprojection_px")) is not None and pixels > 1.5:
         yield Caution(
@@ -120,6 +120,13 @@ def _about_points(summary: Mapping[str, Any]) -> Iterator[Caution]:
             f"{blank:.0%} of the ground that two images or more see has no point: nothing could be matched there.",
             "Trees, water and smooth surfaces are like that; more overlap helps, and so does a larger --size where it "
             "is smaller than the images.",
+        )
+    if (far := summary.get("gps_far_off")) and summary[
+        "cameras_from"
+    ] != "estimated":  # an estimation names them itself
+        yield Caution(
+            f"The GPS position of {names_text(far)} is far from where its camera stands.",
+            "It is left out of the residuals; check the GPS tags of these images, or the cameras that were given.",
         )
     if (share := summary["predicted"] / max(summary["points"], 1)) >= 0.02:
         yield Caution(

@@ -206,6 +206,7 @@ def summarise(
         "metric": block.metric,
         "reprojection_px": block.reprojection_px,
         "gps_rms": block.gps_rms(),
+        "gps_far_off": block.gps_far_off(),
         "gps_antenna_m": block.antenna,
         "ground_control": None if block.survey is None else block.survey.summary(),
         "precision": None if block.precision is None else block.precision.summary(),

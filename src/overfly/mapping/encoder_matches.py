@@ -8,6 +8,7 @@ precise, and throws away what does not agree.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from torch.nn import functional as F
 from overfly.geometry import Array, Camera, invert
 from overfly.mapping.correlate import refine
 from overfly.networks.encoder import MATCH_STRIDE, Encoder
-from overfly.networks.matching import cell_pixels, keypoints, nearest, sample
+from overfly.networks.matching import cell_pixels, keypoints, nearest, nearest_around, sample
 
 WIDTHS = (256, 512)
 """Longer side of the images that the encoder compares, pixels."""
@@ -31,11 +32,22 @@ POINTS = (400, 1200)
 FEWEST = 15
 """Coarse correspondences that must agree about how a frame lies in another; otherwise there is no common ground."""
 
+ENOUGH = 40
+"""Coarse correspondences that agree by no chance: no other guess is better by much."""
+
+FARTHEST = 0.35
+"""How far from the edge of one picture, in its sizes, its priors may put the other one for both to be compared: GPS,
+relief and gimbals move what they see."""
+
 AGREEMENT = 0.75
 """Correlation of the full images from which on a correspondence counts."""
 
 OFF = 1 / 60
 """How far off the common affinity a coarse correspondence may be, widths: what stands high moves more."""
+
+REACH = 1 / 6
+"""How far off the common affinity a fine correspondence is looked for, widths: houses of a fifth of the flight's height
+move by so much at 30 % overlap."""
 
 OFF_PX = 1.5
 """How far off a fine correspondence may be, pixels of the compared images."""
@@ -130,7 +142,7 @@ def match_pair(
     if seen_as is None:
         return Correspondences(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
     fine, other = first.octaves[1], second.octaves[1]
-    index, at = _mutual(encoder, fine, other, seen_as)
+    index, at = _mutual(encoder, fine, other, seen_as, REACH * max(fine.image.shape))
     expected = at * fine.scale + first.points[index] - fine.centres[index] * fine.scale  # of the corner in its cell
     pixels, correlation = refine(
         first.gray, second.gray, first.points[index], _moved(seen_as, expected), _jacobians(seen_as, expected),
@@ -140,17 +152,26 @@ def match_pair(
     return Correspondences(index[good], pixels[good], correlation[good])
 
 
-def overlay(encoder: Encoder, first: Picture, second: Picture) -> Array | None:
+def overlay(encoder: Encoder, first: Picture, second: Picture, guesses: Sequence[Array] | None = None) -> Array | None:
     """How the second picture lies on the first: a homography [3, 3] of full pixels, second from first; None if nowhere.
 
-    The guess is taken, of the ground plane between priors and the four quarter turns, about which most coarse
-    correspondences agree up to an affinity, which then improves it.
+    The guess is taken about which most coarse correspondences agree up to an affinity, which then improves it; the
+    first about which :data:`ENOUGH` do ends the search.
+
+    Args:
+        encoder: a trained network's encoder.
+        first, second: from :func:`picture`.
+        guesses: homographies; None: the ground plane between priors (:func:`by_priors`), then four quarter turns.
     """
     import cv2
 
     coarse, other = first.octaves[0], second.octaves[0]
     best, most = None, FEWEST - 1
-    for guess in _guesses(first, second):
+    if guesses is None:
+        guesses = [*by_priors(first, second), *_quarter_turns(first, second)]
+    for guess in guesses:
+        if most >= ENOUGH:
+            break
         index, at = _mutual(encoder, coarse, other, guess)
         if len(index) <= most:
             continue
@@ -163,6 +184,19 @@ def overlay(encoder: Encoder, first: Picture, second: Picture) -> Array | None:
             scale = np.diag([*coarse.scale, 1.0])
             best = guess @ scale @ np.vstack([affinity, [0, 0, 1]]) @ np.linalg.inv(scale)
     return best
+
+
+def apart(first: Prior | None, second: Prior | None) -> bool:
+    """Whether priors put the second picture clearly beside the first on level ground; False where one is unknown."""
+    if first is None or second is None:
+        return False
+    camera = second.camera
+    outline = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], float)
+    seen = np.column_stack([outline, np.ones(4)]) @ (_over_ground(first) @ np.linalg.inv(_over_ground(second))).T
+    if not (np.sign(seen[:, 2]) == np.sign(seen[0, 2])).all():  # the horizon is in the picture
+        return False
+    at = seen[:, :2] / seen[:, 2:] / [first.camera.width, first.camera.height]
+    return bool((at.min(0) > 1 + FARTHEST).any() or (at.max(0) < -FARTHEST).any())
 
 
 @torch.no_grad()
@@ -185,11 +219,14 @@ def _match_map(encoder: Encoder, image: NDArray[np.uint8]) -> Tensor:
 
 
 @torch.no_grad()
-def _mutual(encoder: Encoder, first: Octave, second: Octave, seen_as: Array) -> tuple[NDArray[np.int64], Array]:
+def _mutual(
+    encoder: Encoder, first: Octave, second: Octave, seen_as: Array, reach: float | None = None
+) -> tuple[NDArray[np.int64], Array]:
     """Key points [m] of the first and where [m, 2] the second shows them, in the first's pixels, each other's best.
 
     Args:
         seen_as: homography of full pixels, second from first, by which the second is seen as from the first.
+        reach: pixels off where that puts a key point within which it is looked for; None: everywhere.
     """
     import cv2
 
@@ -207,17 +244,30 @@ def _mutual(encoder: Encoder, first: Octave, second: Octave, seen_as: Array) -> 
     )
     match_map = _match_map(encoder, seen)
     queries = first.match_map.flatten(1)[:, first.cells].T
-    there, _ = nearest(queries[None], match_map[None])
-    back, _ = nearest(F.normalize(sample(match_map[None], there), dim=2), first.match_map[None])
-    mutual = np.abs(back[0].numpy() - first.centres).max(1, initial=0) <= MATCH_STRIDE
-    at = there[0].double().numpy()
+    if reach is None:
+        there = nearest(queries[None], match_map[None])[0][0]
+    else:
+        there, _ = nearest_around(queries, match_map, torch.from_numpy(first.centres + margin).float(), reach)
+    looked_for = F.normalize(sample(match_map[None], there[None]), dim=2)
+    if reach is None:
+        back = nearest(looked_for, first.match_map[None])[0][0]
+    else:
+        back, _ = nearest_around(looked_for[0], first.match_map, there - torch.from_numpy(margin).float(), reach)
+    mutual = np.abs(back.numpy() - first.centres).max(1, initial=0) <= MATCH_STRIDE
+    at = there.double().numpy()
     inside = (np.abs(_moved(own, at) / second.image.shape[1::-1] - 0.5) < 0.5).all(1)
     index = np.flatnonzero(mutual & inside)
     return index, at[index] - margin
 
 
-def _guesses(first: Picture, second: Picture) -> list[Array]:
-    """How the second picture may lie on the first: homographies of full pixels, second from first."""
+def by_priors(first: Picture, second: Picture) -> list[Array]:
+    """How the second picture lies on the first by the ground plane between their priors, if both are known."""
+    if first.prior is None or second.prior is None:
+        return []
+    return [_over_ground(second.prior) @ np.linalg.inv(_over_ground(first.prior))]
+
+
+def _quarter_turns(first: Picture, second: Picture) -> list[Array]:
     sizes = [np.array(item.gray.shape[::-1], float) for item in (first, second)]
     zoom = sizes[1].max() / sizes[0].max()
     guesses = []
@@ -226,13 +276,12 @@ def _guesses(first: Picture, second: Picture) -> list[Array]:
         turn[:2, :2] = zoom * np.array([[cosine, -sine], [sine, cosine]])
         turn[:2, 2] = sizes[1] / 2 - turn[:2, :2] @ sizes[0] / 2
         guesses.append(turn)
-    if first.prior is not None and second.prior is not None:
-        ground = []
-        for prior in (first.prior, second.prior):
-            pixels = prior.camera.matrix() @ invert(prior.world_from_camera)[:3]
-            ground.append(pixels[:, [0, 1, 3]])  # ground (x, y, 1) -> pixel
-        guesses.insert(0, ground[1] @ np.linalg.inv(ground[0]))
     return guesses
+
+
+def _over_ground(prior: Prior) -> Array:
+    """The homography [3, 3] from the ground (x, y, 1) to pixels."""
+    return np.asarray((prior.camera.matrix() @ invert(prior.world_from_camera)[:3])[:, [0, 1, 3]])
 
 
 def _moved(homography: Array, pixels: Array) -> Array:

@@ -91,13 +91,13 @@ def gallery(
         Picture(
             "The map",
             "From above",
-            f"{of_what}, straight from above; {up}. White: nothing measured.",
+            f"{of_what}, straight from above; {up}. White: nothing known.",
             pictures.jpeg(enlarged(pictures.top_view(seen) if photo is None else photo)),
         ),
         Picture(
             "The map",
             "Heights",
-            "Surface heights over a hillshade (light from the upper left).",
+            "Heights of the cloud over a hillshade (light from the upper left); dsm.tif closes holes left open here.",
             pictures.png(pictures.height_map(seen, offset=height_offset, unit=unit)),
         ),
         Picture(
@@ -126,7 +126,10 @@ def gallery(
     if cloud.predicted is not None and cloud.predicted.any():
         picture = pictures.origin_map(seen, unit=unit)
         assert picture is not None
-        caption = "Where the surface was measured, and where it is only predicted: do not measure there."
+        caption = (
+            "Where the cloud was measured, and where it is only predicted: do not measure there. White: no points; "
+            "dsm_source.tif tells which of these places dsm.tif interpolates."
+        )
         shown.append(Picture("Measured and predicted", "Measured and predicted ground", caption, pictures.png(picture)))
     return shown, replace(seen, views=views)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from overfly import __version__
 from overfly.errors import InputError
-from overfly.flights import Flight, read_calibration, read_flight, with_calibration
+from overfly.flights import Flight, read_calibration, read_flight, source_remarks, with_calibration
 from overfly.geodesy import crs_code
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
 from overfly.mapping.deliver import deliver
@@ -117,6 +118,7 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
                 "would not be used: add --cameras estimate, or leave it out."
             )
         flight = with_calibration(flight, read_calibration(asked.calibration), asked.calibration)
+        steps.say("lens", f"kept from {asked.calibration}: {_focal_text(flight)}")
     lenses = sorted({repr(f.calibration) for f in flight.frames if f.calibration is not None})
     matched = [asked.seed, *ruled, *asked.matcher_key(), *lenses]
     key = key_of(__version__, BLOCK_FORM, identity, estimate, matched if estimate else None)
@@ -178,7 +180,7 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
         assert asked.run is not None
         return asked.run.network.encoder
 
-    return checked(
+    block = checked(
         align(
             flight,
             workdir=scratch,
@@ -190,6 +192,7 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
         ),
         flight,
     )
+    return replace(block, warnings=[*block.warnings, *(source_remarks(asked.calibration) if asked.calibration else [])])
 
 
 def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Tiles:
@@ -201,7 +204,7 @@ def sweep_cloud(block: Block, flight: Flight, scratch: Path, asked: MapSettings,
     """The dense cloud by the trained network, in the block's frame."""
     run = asked.run
     assert run is not None
-    if getattr(run.network, "predicts_surfaces", False):
+    if _measures(asked):
         from overfly.mapping.sweep import SweepOpinions
 
         sparse = block.points is not None and len(block.points) >= FEWEST_POINTS
@@ -284,8 +287,22 @@ def _about_block(block: Block, flight: Flight) -> str:
     return f"{text}, local frame" if block.metric else f"{text}, metric scale unknown"
 
 
+def _focal_text(flight: Flight) -> str:
+    """The focal lengths of the calibrations that are kept."""
+    kept = sorted({round(f.pinhole.fx) for f in flight.frames if f.pinhole is not None})
+    return f"focal length {', '.join(map(str, kept))} px"
+
+
 def _how(asked: MapSettings) -> str:
-    return "semi-global stereo" if asked.dense == "stereo" else f"the network {asked.network_name or ''}".strip()
+    if asked.dense == "stereo":
+        return "semi-global stereo"
+    network = "the shipped network" if asked.network_name == "shipped" else f"the network {asked.network_name or ''}"
+    return (f"stereo and {network}" if _measures(asked) else network).strip()
+
+
+def _measures(asked: MapSettings) -> bool:
+    """Whether the network tells surfaces that are measured together with pairs."""
+    return asked.run is not None and getattr(asked.run.network, "predicts_surfaces", False)
 
 
 def _camera_files(root: Path) -> list[tuple[str, int, int]]:

@@ -69,9 +69,10 @@ def network_cloud(
         progress: called with (windows done, windows in all).
 
     Returns:
-        Points with colour, ``views`` (frames that see the point), ``predicted`` (fewer than two do), ``sigma_m`` and
-        ``confidence`` (spread and agreement in height between windows, see :func:`agreement`). Where windows overlap,
-        one point per voxel of the network's ground sampling distance is kept, the most confident one.
+        Points with colour, ``views`` (frames that see the point), ``predicted`` (all are: these networks measure
+        nothing that pairs could check), ``sigma_m`` and ``confidence`` (spread and agreement in height between windows,
+        see :func:`agreement`). Where windows overlap, one point per voxel of the network's ground sampling distance is
+        kept, the most confident one.
 
     Raises:
         InputError: no camera sees the ground, or the network's answer is not finite.
@@ -210,7 +211,7 @@ def merge(parts: Sequence[Array], owners: Sequence[int], views: Sequence[View], 
         confidence=share.astype(np.float32),
         sigma_m=sigma.astype(np.float32),
         views=np.minimum(seen, 255).astype(np.uint8),
-        predicted=seen < 2,
+        predicted=np.ones(len(points), bool),
     )
 
 

@@ -118,12 +118,17 @@ def agrees_with_gps(bundle: Bundle, told: Array) -> bool:
     return float(np.nanmedian(away)) < usual and float(np.nanmax(away)) < LOST * usual
 
 
+def far_off(distance: Array) -> NDArray[np.bool_]:
+    """Which of positions that are so many metres off [n] are wrong: further than most, and than an antenna makes it."""
+    return np.asarray(distance > max(FAR_OFF_M, 6 * float(np.nanmedian(distance))))
+
+
 def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warnings: list[str]) -> Array:
     """GPS positions [n, 3] with what is wrong taken out: single positions, single heights, heights of wrong sign."""
     places = places.copy()
     away = bundle.centres - places
     flat = np.linalg.norm(away[:, :2], axis=1)
-    wrong = flat > max(FAR_OFF_M, 6 * float(np.nanmedian(flat)))
+    wrong = far_off(flat)
     if wrong.any():
         warnings.append(f"The GPS position of {_some(wrong, frames)} is far off and was not used.")
     places[wrong] = np.nan

@@ -189,7 +189,10 @@ def claim(out: Path, flight: Path, identity: str, *, overwrite: bool) -> Path:
     work = out / "work"
     mark = work / "flight.json"
     if not overwrite:
-        if mark.is_file():
+        if mark.is_file() and {path.name for path in out.iterdir()} | {path.name for path in work.iterdir()} != {
+            "work",
+            mark.name,
+        }:  # one that was refused before it computed anything holds no map
             with contextlib.suppress(json.JSONDecodeError):
                 owner: Mapping[str, str] = json.loads(mark.read_text())
                 if owner.get("flight") != str(flight) and owner.get("identity") != identity:

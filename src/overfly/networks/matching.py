@@ -6,6 +6,7 @@ a map of ``stride`` s is centred on pixel (s (column + 0.5), s (row + 0.5)). All
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from overfly.networks.encoder import MATCH_STRIDE
+
+TILE = 24
+"""Cells along a side of the squares whose queries share a window."""
 
 
 class Matches(NamedTuple):
@@ -95,6 +99,35 @@ def nearest(queries: Tensor, match_map: Tensor, stride: int = MATCH_STRIDE) -> t
         offsets.append(torch.where(inner & (curvature < -1e-6), shift.clamp(-0.5, 0.5), torch.zeros_like(shift)))
     refined = torch.stack([column, row], -1) + 0.5 + torch.stack(offsets, -1)
     return refined * stride, score
+
+
+def nearest_around(
+    queries: Tensor, match_map: Tensor, around: Tensor, reach: float, stride: int = MATCH_STRIDE
+) -> tuple[Tensor, Tensor]:
+    """:func:`nearest` in one image, where it is known roughly where to look: a small part of the cells is compared.
+
+    Args:
+        queries: unit vectors [M, C].
+        match_map: unit vectors [C, h, w].
+        around: pixels [M, 2] about which each is looked for.
+        reach: pixels off them to each side, at the least: queries that lie together share a window.
+
+    Returns:
+        Pixels [M, 2] and the cosine similarity [M] of the best cell.
+    """
+    h, w = match_map.shape[1:]
+    pixels, score = torch.zeros_like(around), around.new_zeros(len(around))
+    limit = torch.tensor([w, h], device=around.device) - 1
+    cell = torch.minimum((around / stride).long().clamp(min=0), limit)
+    tile, cells = cell // TILE, math.ceil(reach / stride)
+    for column, row in tile.unique(dim=0).tolist():
+        own = ((tile[:, 0] == column) & (tile[:, 1] == row)).nonzero()[:, 0]
+        left, top = (max(0, TILE * k - cells) for k in (column, row))
+        window = match_map[None, :, top : TILE * (row + 1) + cells, left : TILE * (column + 1) + cells]
+        found, similarity = nearest(queries[None, own], window, stride)
+        pixels[own] = found[0] + torch.tensor([left, top], device=found.device) * stride
+        score[own] = similarity[0]
+    return pixels, score
 
 
 @torch.no_grad()

@@ -111,9 +111,10 @@ class Check:
         for label, value in self._rows():
             table.add_row(label, value)
         assumed = "Without positions overlap cannot be told." if self.placed is None else self.placed.assumed
+        if self.seen is not None:
+            assumed += f" Sigma of well matched points at {SIGMA_PX} px: plants and the error of GPS are not in it."
         table.caption = (
-            f"{assumed} Sigma of well matched points at {SIGMA_PX} px: plants and the error of GPS are not in it. Time"
-            " at the measured rate of maps with estimated cameras, memory by the map's own estimate."
+            f"{assumed} Time at the measured rate of maps with estimated cameras, memory by the map's own estimate."
         )
         table.caption_justify = "left"
         return table

@@ -8,6 +8,7 @@ import numpy as np
 
 from overfly.flights import Flight, Frame
 from overfly.geometry import Array
+from overfly.mapping.control import FEWEST
 from overfly.preflight.displacements import Displacements
 from overfly.preflight.evidence import Evidence
 from overfly.preflight.findings import Finding, count, some
@@ -54,13 +55,17 @@ def _evidence(flight: Flight, xy: Array, placed: Placement | None, looks: Sequen
 
 def _missing(flight: Flight) -> Iterator[Finding]:
     without = [f.name for f in flight.frames if f.gps is None]
-    total = len(flight.frames)
+    total, held = len(flight.frames), len(flight.gcps) >= FEWEST
     if len(without) == total and flight.cameras_from is None:
         yield Finding(
-            "bad",
+            "warn" if held else "bad",
             "gps",
-            f"None of the {total} images has a GPS position, so overlap cannot be told beforehand and the map will "
-            "have no metric scale",
+            f"None of the {total} images has a GPS position, so overlap cannot be told beforehand"
+            + (
+                ", and ground control alone gives the map its scale"
+                if held
+                else " and the map will have no metric scale"
+            ),
             "switch on geotagging, or put a geo.txt with the positions beside the images",
         )
     elif without and flight.cameras_from is None:

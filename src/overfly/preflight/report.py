@@ -22,10 +22,11 @@ def check_and_tell(
     """Check a flight, print and write what was found; 1 where it cannot give a map, else 0.
 
     Raises:
-        InputError: a bad value, or ``picture`` is asked for where the overlap is not known.
+        InputError: a bad value. A ``picture`` that cannot be drawn, since the overlap is not known, is only a note.
     """
     from rich.console import Console
     from rich.progress import Progress
+    from rich.text import Text
 
     if picture is not None and picture.suffix.lower() != ".png":
         raise InputError(f"--picture {picture} is not a PNG file: give a name that ends in .png.")
@@ -42,9 +43,13 @@ def check_and_tell(
         with replacing(json) as temporary:
             temporary.write_text(jsons.dumps(found.to_dict(), indent=2) + "\n", encoding="utf-8")
     if picture is not None:
-        data = found.picture()
-        with replacing(picture) as temporary:
-            temporary.write_bytes(data)
+        try:
+            data = found.picture()
+        except InputError as error:
+            Console(stderr=True).print(Text(f"{picture} was not written: {error}"), soft_wrap=True)
+        else:
+            with replacing(picture) as temporary:
+                temporary.write_bytes(data)
     return 0 if found.mappable else 1
 
 

@@ -76,7 +76,8 @@ class GanStage(Stage):
         if stage == "fit" and not int(self.part("generator").steps):
             line = self._blocks_from_encoder()
             if not int(self.part("encoder").steps):
-                log.info("%s, which itself starts at random (seeded)", line)
+                own = hasattr(self.network.generator, "start_from")
+                log.info("%s%s", line, ", which itself starts at random (seeded)" if own else "")
 
     def on_fit_start(self) -> None:
         if self.frozen is None:
