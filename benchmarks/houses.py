@@ -1,7 +1,8 @@
 """Do roofs and walls of single houses stand out? Surface models of two programs as hillshades of the same ground.
 
     overfly map DATA/tampa_sheffield_cross --out tampa
-    ppg new t.ppg; ppg add-photos t.ppg DATA/tampa_sheffield_cross/images; for s in align dense dem; do ppg $s t.ppg; done
+    ppg new t.ppg; ppg add-photos t.ppg DATA/tampa_sheffield_cross/images; ppg align t.ppg
+    ppg dense t.ppg; ppg dem t.ppg
     python benchmarks/houses.py tampa/dsm.tif t.ppg.files/chunk_0/dem.tif --out docs/houses.jpg
 
 Both rasters are laid on the cells of the first one; nothing is smoothed or aligned. ``--window`` takes a part of it,
