@@ -5,8 +5,8 @@
     ppg dense t.ppg; ppg dem t.ppg
     python benchmarks/houses.py tampa/dsm.tif t.ppg.files/chunk_0/dem.tif --out docs/houses.jpg
 
-Both rasters are laid on the cells of the first one; nothing is smoothed or aligned. ``--window`` takes a part of it,
-left, top, width and height as shares.
+Both rasters are laid on the cells of the first one (the second bilinearly), and not aligned. ``--window`` takes
+a part of it, left, top, width and height as shares.
 """
 
 from __future__ import annotations

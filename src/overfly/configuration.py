@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -61,24 +62,29 @@ def check(cfg: DictConfig) -> None:
     if unknown_keys:
         raise InputError(_no_key(unknown_keys[0]))
     size = OmegaConf.to_container(cfg.image_size) if OmegaConf.is_list(cfg.image_size) else cfg.image_size
-    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(x, int) and x > 0 for x in size)):
+    if not (isinstance(size, list) and len(size) == 2 and all(type(x) is int and x > 0 for x in size)):
         raise InputError(f"image_size={size} is not possible: give width and height in pixels, image_size=[128,96].")
     if not isinstance(cfg.frames, int) or not 1 <= cfg.frames <= 8:
         raise InputError(f"frames={cfg.frames} is not possible: a window has 1 to 8 frames, for instance frames=3.")
 
 
-def _top_keys() -> set[str]:
+@lru_cache(maxsize=1)
+def _top_keys() -> frozenset[str]:
     """Every key that may stand at the top: of the primary file, of files that are laid over all, and the groups."""
     keys = {path.name for path in conf_dir().iterdir() if path.is_dir()}
     for path in conf_dir().rglob("*.yaml"):
         if path.parent == conf_dir() or path.read_text().startswith("# @package _global_"):
             keys |= {str(key) for key in OmegaConf.load(path)}
-    return keys - {"defaults"}
+    return frozenset(keys - {"defaults"})
 
 
 def _no_key(key: str) -> str:
     from difflib import get_close_matches
 
+    if key in _top_keys():
+        files = [p for p in conf_dir().glob("*/*.yaml") if re.search(rf"^{key}:", p.read_text(), re.MULTILINE)]
+        groups = " or ".join(sorted(f"{p.parent.name}={p.stem}" for p in files))
+        return f"The key {key!r} belongs to {groups}: add that, or leave {key} out."
     near = get_close_matches(key, _top_keys(), 1)
     meant = f" Did you mean {near[0]}?" if near else ""
     return f"There is no key {key!r}.{meant} Type `python train.py --cfg job` to see every key."

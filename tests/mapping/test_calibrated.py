@@ -14,7 +14,7 @@ from overfly.flights import ControlPoint, Flight, with_calibration, write_transf
 from overfly.geodesy import crs_from_enu
 from overfly.geometry import Array, Camera, distort, pixel_grid, project, rays
 from overfly.mapping.align import align
-from overfly.mapping.calibration import composed
+from overfly.mapping.calibration import KEPT, UNTOLD, composed, source_remarks
 from overfly.mapping.map import align_flight
 
 pytestmark = pytest.mark.usefixtures("few_features")
@@ -123,3 +123,23 @@ def test_the_lens_in_the_photos_is_where_the_calibration_starts(hill, strips, tm
     points = rays(pixel_grid(320, 240)[::20, ::20], WARM)[..., :2].reshape(-1, 2)
     pixels = [distort(points, c) * [c.fx, c.fy] + [c.cx, c.cy] for c in (block.cameras[0], WARM)]
     assert np.median(np.linalg.norm(pixels[0] - pixels[1], axis=1)) < 0.5
+    assert not any("focal length" in warning for warning in block.warnings)
+    doubled = replace(RAW, fx=2 * RAW.fx, fy=2 * RAW.fy)
+    cut = replace(flight, frames=[replace(f, lens=doubled) for f in flight.frames])
+    block = align(cut, workdir=tmp_path / "cut", seed=0, bar=bar)
+    assert any("DewarpData" in warning and "was not used" in warning for warning in block.warnings)
+
+
+def test_a_calibration_tells_what_its_map_doubted_also_over_two_maps(tmp_path: Path) -> None:
+    told = tmp_path / "map.json"
+    for said, remarks in ((f'["{UNTOLD}: ..."]', 1), (f'["{KEPT} (x): ..."]', 1), ('["else"]', 0), ("null", 0)):
+        told.write_text(f'{{"warnings": {said}}}')
+        for path in (tmp_path, tmp_path / "transforms.json"):
+            assert len(source_remarks(path)) == remarks
+    assert source_remarks(tmp_path / "elsewhere" / "cameras.txt") == []
+
+
+def test_a_calibration_of_another_camera_is_held_against_the_photos_data(hill, line, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    other = replace(LENS, fx=2 * LENS.fx, fy=2 * LENS.fy)
+    block = align(with_calibration(line, [other], "x"), workdir=tmp_path, seed=0, bar=bar)
+    assert any("The calibration has a focal length of 640 px, the photos' data say 343" in w for w in block.warnings)

@@ -155,23 +155,35 @@ def test_priors_tell_which_pictures_lie_apart(camera, strips) -> None:  # type: 
 def test_where_priors_are_right_no_turns_are_tried(  # type: ignore[no-untyped-def]
     hill, camera, strips, encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("overfly.mapping.matches.TRUSTED", 1)
-    asked: list[int | None] = []
+    asked: list[int] = []
 
     def counted(*arguments: Any) -> Any:
-        asked.append(None if len(arguments) < 4 else len(arguments[3]))
+        asked.append(len(arguments[3]))
         return overlay(*arguments)
 
     monkeypatch.setattr("overfly.mapping.matches.overlay", counted)
     frames = hill.frames(tmp_path, camera, strips[:3], known=False)
-    cv2.imwrite(str(frames[2].path), np.random.default_rng(0).integers(0, 255, (240, 320, 3), dtype=np.uint8))
     given = [Prior(camera, pose) for pose in strips[:3]]
-    _, matches = encoder_matches(frames, [(0, 1), (1, 2)], encoder, priors=given, progress=lambda done, total: None)
-    assert list(matches) == [(0, 1)]
-    assert asked == [1, 1]  # the ground plane alone, in both pairs
-    asked.clear()
-    encoder_matches(frames, [(1, 2)], encoder, priors=given, progress=lambda done, total: None)
-    assert asked == [1, None]  # not trusted yet: turns are tried as well
+    _, matches = encoder_matches(frames, PAIRS, encoder, priors=given, progress=lambda done, total: None)
+    assert list(matches) == PAIRS
+    assert asked == [1, 1, 1]  # the ground plane alone
+
+
+PAIRS = [(0, 1), (1, 2), (0, 2)]
+
+
+@pytest.mark.parametrize("wrong", ["a position", "all heights"])
+def test_wrong_priors_cost_no_pair(hill, camera, strips, encoder, tmp_path: Path, wrong: str) -> None:  # type: ignore[no-untyped-def]
+    frames = hill.frames(tmp_path, camera, strips[:3], known=False)
+    poses = [pose.copy() for pose in strips[:3]]
+    if wrong == "a position":
+        poses[2][0, 3] += 400
+    else:
+        for pose in poses:
+            pose[2, 3] /= 4  # a take-off on a hill
+    given = [Prior(camera, pose) for pose in poses]
+    _, matches = encoder_matches(frames, PAIRS, encoder, priors=given, progress=lambda done, total: None)
+    assert list(matches) == PAIRS
 
 
 @pytest.mark.parametrize("matcher", ["encoder", "both"])

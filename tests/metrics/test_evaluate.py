@@ -65,6 +65,14 @@ def test_what_sampling_alone_makes_of_the_1024_points_is_told() -> None:
     assert f"{result['emd_floor_m']:.3f}" in console.export_text()
 
 
+def test_a_reference_too_small_for_two_samples_has_no_floor() -> None:
+    result = evaluate(Cloud(surface(1500)), Cloud(surface(1500)), voxel_m=0)
+    assert result["emd_floor_m"] is result["chamfer_sum_1024_floor"] is None
+    console = Console(width=150, record=True, file=io.StringIO())
+    console.print(format_table(result))
+    assert "two samples" not in console.export_text()
+
+
 def test_a_reference_sparser_than_the_thresholds_is_warned_of() -> None:
     sparse, dense = Cloud(surface(2000)), Cloud(surface(200_000))
     assert any("0.37 m apart" in warning and "denser" in warning for warning in evaluate(dense, sparse)["warnings"])

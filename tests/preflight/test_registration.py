@@ -51,9 +51,9 @@ def test_an_image_without_a_position_overlaps_as_the_others_do():
     assert placed_chances(names, np.ones(4), [], None).min() > 0.99
 
 
-def test_views_from_a_third_of_a_turn_apart_do_not_match():
-    down, tilted, oblique = [0, 0, -1], [0.17, 0, -0.985], [-0.5, 0, -0.866]
+def test_views_from_far_apart_do_not_match():
+    down, tilted, oblique = [0, 0, -1], [0.1908, 0, -0.9816], [-0.6428, 0, -0.766]  # 0, 11 and -40 degrees
     found = facing(np.array([down, tilted, oblique]))
     assert found[0, 1] == pytest.approx(1, abs=0.01)
     assert found[1, 2] == 0
-    assert found[0, 2] == pytest.approx(0.25, abs=0.01)
+    assert found[0, 2] == pytest.approx(1 / 3, abs=0.01)

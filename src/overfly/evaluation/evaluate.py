@@ -66,7 +66,8 @@ def evaluate(
     Returns:
         The rows of the table.
     """
-    kept = _read(folder / KEPT, set(networks))
+    estimated = any(bool(_dataset(loader).estimated) for loader in loaders.values())
+    kept = _read(folder / KEPT, set(networks), estimated)
     total = sum(len(_dataset(loader)) for loader in loaders.values())
     log.info("%d of %d windows were measured before", len(kept), total) if kept else None
     with replacing(folder / KEPT) as part:  # without what a kill left unfinished
@@ -83,7 +84,7 @@ def evaluate(
                 others = baselines() if others is None else others
                 emd = [emd_windows > 0 and int(index) % step == 0 for index in batch["index"]]
                 for window in measure(batch, others, networks, emd):
-                    window |= {"split": GROUPS[split], **_facts(dataset, window["index"])}
+                    window |= {"split": GROUPS[split], "estimated": estimated, **_facts(dataset, window["index"])}
                     if (split, window["index"]) not in kept:
                         kept[split, window["index"]] = window
                         file.write(json.dumps(window) + "\n")
@@ -120,11 +121,15 @@ def measure(
         {"form": FORM, "index": int(index), "scene": int(scene), "clouds": {}, "calibration": {}, "encoders": {}}
         for index, scene in zip(batch["index"], batch["scene"], strict=True)
     ]
+    cameras = [camera_values(batch, number) for number in range(len(windows))]
     for name, answer in answers.items():
         for number, (window, truth) in enumerate(zip(windows, known, strict=True)):
             values, calibration = surface_values(answer, number, truth)
-            cameras = camera_values(batch, number)
-            window["clouds"][name] = {**cloud_values(answer, number, truth, emd=emd[number]), **values, **cameras}
+            window["clouds"][name] = {
+                **cloud_values(answer, number, truth, emd=emd[number]),
+                **values,
+                **cameras[number],
+            }
             if calibration is not None:
                 window["calibration"][name] = calibration
     for name, network in networks.items():
@@ -193,8 +198,9 @@ def _facts(dataset: WindowDataset, index: int) -> dict[str, Any]:
     return {name: round(value) if isinstance(value, float) else value for name, value in named.items()}
 
 
-def _read(path: Path, networks: set[str]) -> dict[tuple[str, int], dict[str, Any]]:
-    """What a stopped evaluation has measured; unfinished lines and those of other networks or methods do not count."""
+def _read(path: Path, networks: set[str], estimated: bool) -> dict[tuple[str, int], dict[str, Any]]:
+    """What a stopped evaluation has measured; unfinished lines and those of other networks, methods or cameras do not
+    count."""
     splits = {group: split for split, group in GROUPS.items()}
     kept: dict[tuple[str, int], dict[str, Any]] = {}
     lines = path.read_text().splitlines() if path.is_file() else []
@@ -203,7 +209,8 @@ def _read(path: Path, networks: set[str]) -> dict[tuple[str, int], dict[str, Any
             window = json.loads(line)
         except json.JSONDecodeError:
             continue
-        if set(window["encoders"]) == networks and window.get("form") == FORM:
+        same = set(window["encoders"]) == networks and window.get("estimated", False) == estimated
+        if same and window.get("form") == FORM:
             kept[splits[window["split"]], window["index"]] = window
     return kept
 

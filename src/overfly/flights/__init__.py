@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from overfly.flights.calibration import UNTOLD, read_calibration, source_remarks, with_calibration
+    from overfly.flights.calibration import read_calibration, with_calibration
     from overfly.flights.cameras import CAMERAS, CameraPreset, camera_preset, find_preset
     from overfly.flights.colmap import read_colmap
     from overfly.flights.flight import ControlPoint, Flight, Frame, Gps
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 _HOME = {
     "read_calibration": "calibration",
     "with_calibration": "calibration",
-    "source_remarks": "calibration",
-    "UNTOLD": "calibration",
     "CAMERAS": "cameras",
     "CameraPreset": "cameras",
     "camera_preset": "cameras",
@@ -50,7 +48,6 @@ __all__ = [
     "CAMERAS",
     "NOISE",
     "PATHS",
-    "UNTOLD",
     "CameraPreset",
     "ControlPoint",
     "Flight",
@@ -66,7 +63,6 @@ __all__ = [
     "read_calibration",
     "read_colmap",
     "read_flight",
-    "source_remarks",
     "with_calibration",
     "write_flight",
     "write_transforms",

@@ -31,9 +31,6 @@ FILES = (
 """Where a folder may hold cameras, in the order in which they are looked for."""
 
 
-UNTOLD = "The images do not tell the focal length"
-"""How the warning of a map begins whose camera is not known well."""
-
 ALLOWED = (
     "Give the folder of a map or flight, a transforms.json, COLMAP's cameras.txt or .bin, OpenSfM's "
     "reconstruction.json or the cameras.json of ODM."
@@ -73,23 +70,6 @@ def with_calibration(flight: Flight, cameras: list[Camera], source: str) -> Flig
         InputError: none or several of the cameras have the shape of an image.
     """
     return replace(flight, frames=[replace(f, calibration=_fitting(f, cameras, source)) for f in flight.frames])
-
-
-def source_remarks(path: Path | str) -> list[str]:
-    """What the map said that a calibration comes from: whether its images told the focal length."""
-    told = Path(path) / "map.json"
-    if not told.is_file():
-        return []
-    try:
-        said = [str(text) for text in json.loads(told.read_text(encoding="utf-8")).get("warnings", [])]
-    except (ValueError, AttributeError):
-        return []
-    if not any(text.startswith(UNTOLD) for text in said):
-        return []
-    return [
-        f"The calibration of {path} is kept, but that map's images did not tell its focal length well: differences in "
-        "height may be wrong by as much as there. Calibrate from another height, over relief, or with ground control."
-    ]
 
 
 def _fitting(frame: Frame, cameras: list[Camera], source: str) -> Camera:

@@ -100,7 +100,8 @@ def read_facts(path: Path) -> Facts:
         original = positive(details.get(PIXELS_X)) or facts.width
         facts.focal_px = facts.focal_mm * per_unit / unit_mm * facts.width / original
     _read_gps(position, facts)
-    _read_xmp(xmp if isinstance(xmp, str) else bytes(xmp).decode("utf-8", "replace"), facts)
+    _read_xmp(xmp if isinstance(xmp, str) else bytes(xmp).decode("utf-8", "replace"), facts,
+              (positive(details.get(PIXELS_X)), positive(details.get(PIXELS_Y))))  # fmt: skip
     return facts
 
 
@@ -145,7 +146,7 @@ def _read_gps(tags: dict, facts: Facts) -> None:
     facts.gps = Gps(latitude, longitude, altitude)
 
 
-def _read_xmp(packet: str, facts: Facts) -> None:
+def _read_xmp(packet: str, facts: Facts, original: tuple[float | None, float | None]) -> None:
     """DJI's tags, as attributes or as elements."""
 
     def value(name: str) -> float | None:
@@ -158,15 +159,19 @@ def _read_xmp(packet: str, facts: Facts) -> None:
     yaw, pitch, roll = (value(f"Gimbal{axis}Degree") for axis in ("Yaw", "Pitch", "Roll"))
     if yaw is not None and pitch is not None:
         facts.gimbal = (yaw, pitch, roll or 0.0)
-    _read_lens(packet, value, facts)
+    _read_lens(packet, value, facts, original)
     stds = [value(f"RtkStd{axis}") for axis in ("Lat", "Lon", "Hgt")]
     if facts.gps is not None and all(stds):
         gps = facts.gps
         facts.gps = Gps(gps.latitude, gps.longitude, gps.altitude, max(stds[0] or 0, stds[1] or 0), stds[2])
 
 
-def _read_lens(packet: str, value: Callable[[str], float | None], facts: Facts) -> None:
+def _read_lens(
+    packet: str, value: Callable[[str], float | None], facts: Facts, original: tuple[float | None, float | None]
+) -> None:
     """DJI's DewarpData, "date;fx,fy,cx,cy,k1,k2,p1,p2,k3" in pixels of the full image, cx and cy from its middle.
+
+    How large the full image was, twice the optical centre tells, else EXIF (``original``); else the lens is not used.
 
     Images that the camera has straightened itself have another lens, of which nothing is told.
     """
@@ -175,12 +180,13 @@ def _read_lens(packet: str, value: Callable[[str], float | None], facts: Facts) 
         return
     numbers = [number(part) for part in found.group(1).split(",")]
     middle = value("CalibratedOpticalCenterX"), value("CalibratedOpticalCenterY")
-    width, height = (2 * m if m else side for m, side in zip(middle, (facts.width, facts.height), strict=True))
+    width, height = (2 * m if m else side for m, side in zip(middle, original, strict=True))
     if len(numbers) < 9 or any(n is None for n in numbers[:9]):
         facts.notes.append("unreadable DewarpData")
         return
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(n or 0) for n in numbers[:9])
-    if fx <= 0 or fy <= 0 or abs(width * facts.height / (height * facts.width) - 1) > SHAPE:
+    width, height = width or 0.0, height or 0.0
+    if fx <= 0 or fy <= 0 or not width or not height or abs(width * facts.height / (height * facts.width) - 1) > SHAPE:
         return  # zeros of a camera that was never calibrated, or a part of the image
     lens = Camera(round(width), round(height), fx, fy, width / 2 + cx, height / 2 + cy, k1, k2, p1, p2, k3)
     if invertible(lens):

@@ -23,6 +23,10 @@ def metadata_remarks(frames: list[Frame], facts: list[Facts]) -> list[str]:
     notes = Counter(note for f in facts for note in f.notes)
     if notes["unreadable EXIF"]:
         remarks.append(f"The EXIF of {notes['unreadable EXIF']} of {total} images cannot be read and is left out.")
+    if notes["unreadable DewarpData"]:
+        remarks.append(
+            f"The lens in {notes['unreadable DewarpData']} of {total} images (DewarpData) is unreadable and left out."
+        )
     for note, what in (("unreadable GPS", "cannot be read (0/0)"), ("GPS 0, 0", "is latitude 0, longitude 0 (no fix)")):
         names = [fr.name for fr, fa in zip(frames, facts, strict=True) if note in fa.notes and fr.gps is None]
         if names:

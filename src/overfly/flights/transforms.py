@@ -134,6 +134,8 @@ def transforms_camera(values: dict[str, Any], image: Path | None, where: str) ->
         raise InputError(f"{where}: no focal length: give fl_x in pixels, at the top of the file or in the frame.")
     lens = {} if model != "OPENCV" else {k: float(values.get(k, 0.0)) for k in ("k1", "k2", "p1", "p2", "k3")}
     fy = values.get("fl_y", focal) if model != "SIMPLE_PINHOLE" else focal
+    if fy <= 0:
+        raise InputError(f"{where}: fl_y={fy} is not possible: give pixels above 0, or leave it out.")
     return Camera(w, h, float(focal), float(fy), float(values.get("cx", w / 2)), float(values.get("cy", h / 2)), **lens)
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from overfly.errors import InputError
-from overfly.flights import UNTOLD, Flight, Frame
+from overfly.flights import Flight, Frame
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array, Camera
 from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
 from overfly.mapping.bundle import Bundle
-from overfly.mapping.calibration import FOCAL_TRIED, adjusted_twice, calibrated, composed, held_by_images
+from overfly.mapping.calibration import FOCAL_TRIED, UNTOLD, adjusted_twice, calibrated, composed, held_by_images
 from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, strongest_pair
@@ -79,6 +79,7 @@ def align(
         control_places(flight.gcps)  # refuses a CRS that does not fit, or lacks its grid, before the long steps
     workdir.mkdir(parents=True, exist_ok=True)
     warnings: list[str] = []
+    flight = _without_doubtful_lenses(flight, warnings)
     origin, told = gps_frame(flight)
 
     def matches_by(how: str) -> tuple[Path, list[str]]:
@@ -179,6 +180,23 @@ def _held_block(
         )
     _remark_focal(result.bundle, [flight.frames[i] for i in result.bundle.frames], warnings)
     return _block(result, flight.frames, origin, metric, ruled, at is not None, apart, warnings)
+
+
+def _without_doubtful_lenses(flight: Flight, warnings: list[str]) -> Flight:
+    """The flight without lenses in the photos whose focal length the photos' other data contradict."""
+    frames, doubtful = [], []
+    for frame in flight.frames:
+        other = focal_px(replace(frame, lens=None, calibration=None))
+        if frame.lens is not None and other and abs(frame.lens.fx / other - 1) > FOCAL_DRIFT:
+            doubtful.append(f"{frame.lens.fx:.0f} px in {frame.name}, by other data {other:.0f} px")
+            frame = replace(frame, lens=None)
+        frames.append(frame)
+    if doubtful:
+        warnings.append(
+            f"The lens in {len(doubtful)} photos (DewarpData) was not used: its focal length is {doubtful[0]}. Images "
+            "that were cut or resized may keep that of the whole; give a calibrated camera by --calibration."
+        )
+    return replace(flight, frames=frames) if doubtful else flight
 
 
 def _remark_scale(places: Array, sigmas: Array, warnings: list[str]) -> None:

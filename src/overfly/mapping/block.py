@@ -102,7 +102,8 @@ class Block:
         away = self.gps_residuals()
         if np.isnan(away[:, :2]).all():
             return None
-        away[[name in self.gps_far_off() for name in self.names]] = np.nan
+        far = set(self.gps_far_off())
+        away[[name in far for name in self.names]] = np.nan
         rises = away[np.isfinite(away[:, 2]), 2]
         vertical = float(np.sqrt(np.mean((rises - np.median(rises)) ** 2))) if len(rises) else None
         return {

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from overfly.flights import Frame
-from overfly.geometry import Array, Camera, distort, pixel_grid, rays, undistort
+from overfly.geometry import Array, Camera, distort, invertible, pixel_grid, rays, undistort
 from overfly.mapping.adjustment import LENS_SIGMA, Adjusted, Held, adjusted, free
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.database import focal_px
 from overfly.mapping.features import LONGEST_SIDE
 from overfly.mapping.model import FEWEST_TO_CALIBRATE
 from overfly.mapping.placing import widened
+
+UNTOLD = "The images do not tell the focal length"
+KEPT = "The calibration is kept, but the map that it comes from did not tell its focal length well"
+"""How the warnings begin of a map whose camera is not known well, and of one that took it over."""
 
 NOISE_PX = 0.25
 """Standard deviation of a key point, pixels of the picture that was searched: it weighs the images against GPS."""
@@ -113,12 +119,13 @@ def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
         result = lens
     needed, untold = GAIN * result.cost, False
     told = np.isfinite(result.held.focals)
+    doubted = told & ~result.held.lens_fixed & (np.broadcast_to(result.held.focal_sigma, told.shape) > CALIBRATED_SIGMA)
     if (told & ~result.held.lens_fixed).any():
         hopeless = needed / HOPELESS
         focals = np.where(told, result.bundle.lenses[:, 0] * (1 + FOCAL_TRIED), np.nan)
         longer = replace(result.held, focals=focals, focal_sigma=np.full(len(focals), TRIED_SIGMA))
         tried = adjusted(result.bundle, longer, lever=start, tolerance=hopeless, patience=PATIENCE)
-        untold = tried.cost - result.cost < needed
+        untold = bool(doubted.any()) and tried.cost - result.cost < needed
         rays = np.median(np.bincount(result.bundle.image, minlength=len(result.bundle)))
         if np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE and rays >= FEWEST_RAYS_TO_FREE:
             free_focal = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
@@ -139,7 +146,8 @@ def composed(lens: Camera, straightened: Camera) -> Camera:
 
     if not straightened.is_distorted and straightened.fx == np.sqrt(lens.fx * lens.fy):
         return lens
-    seen = rays(pixel_grid(FITTED, FITTED) / FITTED * [lens.width, lens.height], lens)[..., :2].reshape(-1, 2)
+    grid = (pixel_grid(FITTED, FITTED) - 0.5) / (FITTED - 1) * [lens.width, lens.height]  # from border to border
+    seen = rays(grid, lens)[..., :2].reshape(-1, 2)
     # What points the straightened camera sees where the lens alone would see these.
     points = undistort(seen * (np.sqrt(lens.fx * lens.fy) / straightened.fx), straightened)
     target = distort(seen, lens) * [lens.fx, lens.fy] + [lens.cx, lens.cy]
@@ -155,4 +163,24 @@ def composed(lens: Camera, straightened: Camera) -> Camera:
         return np.asarray(distort(points, c) * [c.fx, c.fy] + [c.cx, c.cy] - target).ravel()
 
     start = np.array([getattr(lens, name) for name in names]) / scale
-    return camera(least_squares(misses, start, method="lm", xtol=1e-12, ftol=1e-12).x)
+    found = camera(least_squares(misses, start, method="lm", xtol=1e-12, ftol=1e-12).x)
+    if invertible(found):
+        return found
+    share = straightened.fx / float(np.sqrt(lens.fx * lens.fy))  # terms that make no lens together
+    return replace(lens, fx=lens.fx * share, fy=lens.fy * share)
+
+
+def source_remarks(path: Path | str) -> list[str]:
+    """What the map said that a calibration comes from, in its folder or beside a file: whether it knew its camera."""
+    given = Path(path)
+    told = (given if given.is_dir() else given.parent) / "map.json"
+    try:
+        said = json.loads(told.read_text(encoding="utf-8")).get("warnings")
+    except (OSError, ValueError, AttributeError):
+        return []
+    if not isinstance(said, list) or not any(str(text).startswith((UNTOLD, KEPT)) for text in said):
+        return []
+    return [
+        f"{KEPT} ({told.parent}): differences in height may be wrong by as much as there. Calibrate from "
+        "another height, over relief, or with ground control."
+    ]

@@ -30,7 +30,7 @@ def cautions(
     told = " ".join(from_readers)
     found = [*_about_place(summary, has_gps), *_about_images(summary)]
     found += [c for c in _about_heights(summary, altitudes) if "below" not in c.what or "below sea level" not in told]
-    found += [*_about_points(summary), *_about_geoid(summary)]
+    found += [*_about_far_off(summary.get("gps_far_off", []), told), *_about_points(summary), *_about_geoid(summary)]
     # The readers' sentences on left-out images are covered above, with what to do.
     covered = ("are skipped", "have no camera")
     return found + [Caution(text, "") for text in from_readers if not any(words in text for words in covered)]
@@ -98,6 +98,14 @@ def _about_heights(summary: Mapping[str, Any], altitudes: Altitudes) -> Iterator
             )
 
 
+def _about_far_off(far: Sequence[str], told: str) -> Iterator[Caution]:
+    if far := [name for name in far if name not in told]:  # an estimation has named those that it did not use
+        yield Caution(
+            f"The GPS position of {names_text(far)} is far from where its camera stands.",
+            "It is left out of the residuals; check the GPS tags of these images, or the cameras that were given.",
+        )
+
+
 def _about_geoid(summary: Mapping[str, Any]) -> Iterator[Caution]:
     if summary["heights"] == "ellipsoid" and summary["settings"]["heights"] is None:
         yield Caution(
@@ -120,13 +128,6 @@ def _about_points(summary: Mapping[str, Any]) -> Iterator[Caution]:
             f"{blank:.0%} of the ground that two images or more see has no point: nothing could be matched there.",
             "Trees, water and smooth surfaces are like that; more overlap helps, and so does a larger --size where it "
             "is smaller than the images.",
-        )
-    if (far := summary.get("gps_far_off")) and summary[
-        "cameras_from"
-    ] != "estimated":  # an estimation names them itself
-        yield Caution(
-            f"The GPS position of {names_text(far)} is far from where its camera stands.",
-            "It is left out of the residuals; check the GPS tags of these images, or the cameras that were given.",
         )
     if (share := summary["predicted"] / max(summary["points"], 1)) >= 0.02:
         yield Caution(

@@ -168,7 +168,7 @@ def overlay(encoder: Encoder, first: Picture, second: Picture, guesses: Sequence
     coarse, other = first.octaves[0], second.octaves[0]
     best, most = None, FEWEST - 1
     if guesses is None:
-        guesses = [*by_priors(first, second), *_quarter_turns(first, second)]
+        guesses = [*by_priors(first, second), *quarter_turns(first, second)]
     for guess in guesses:
         if most >= ENOUGH:
             break
@@ -193,7 +193,7 @@ def apart(first: Prior | None, second: Prior | None) -> bool:
     camera = second.camera
     outline = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], float)
     seen = np.column_stack([outline, np.ones(4)]) @ (_over_ground(first) @ np.linalg.inv(_over_ground(second))).T
-    if not (np.sign(seen[:, 2]) == np.sign(seen[0, 2])).all():  # the horizon is in the picture
+    if not (seen[:, 2] * np.sign(seen[:, 2].sum()) > 0).all():  # the horizon is in the picture
         return False
     at = seen[:, :2] / seen[:, 2:] / [first.camera.width, first.camera.height]
     return bool((at.min(0) > 1 + FARTHEST).any() or (at.max(0) < -FARTHEST).any())
@@ -267,7 +267,8 @@ def by_priors(first: Picture, second: Picture) -> list[Array]:
     return [_over_ground(second.prior) @ np.linalg.inv(_over_ground(first.prior))]
 
 
-def _quarter_turns(first: Picture, second: Picture) -> list[Array]:
+def quarter_turns(first: Picture, second: Picture) -> list[Array]:
+    """How the second picture may lie on the first, of which nothing is known: homographies, second from first."""
     sizes = [np.array(item.gray.shape[::-1], float) for item in (first, second)]
     zoom = sizes[1].max() / sizes[0].max()
     guesses = []

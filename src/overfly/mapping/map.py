@@ -14,9 +14,10 @@ import numpy as np
 
 from overfly import __version__
 from overfly.errors import InputError
-from overfly.flights import Flight, read_calibration, read_flight, source_remarks, with_calibration
+from overfly.flights import Flight, read_calibration, read_flight, with_calibration
 from overfly.geodesy import crs_code
 from overfly.mapping.block import Block, checked, given_block, read_block, write_block
+from overfly.mapping.calibration import source_remarks
 from overfly.mapping.deliver import deliver
 from overfly.mapping.heights import check_heights, check_place, with_heights
 from overfly.mapping.needs import Budget, Sizes, allowed_gb, budget, least_gb
@@ -129,6 +130,8 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
         write_block,
         lambda folder: read_block(folder, flight),
     )
+    if asked.calibration is not None:  # not kept with the block: another path may hold the same camera
+        block = replace(block, warnings=[*block.warnings, *source_remarks(asked.calibration)])
     block = with_heights(block, asked.heights)
     steps.say("cameras", _about_block(block, flight))
     return block, key
@@ -180,7 +183,7 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
         assert asked.run is not None
         return asked.run.network.encoder
 
-    block = checked(
+    return checked(
         align(
             flight,
             workdir=scratch,
@@ -192,7 +195,6 @@ def estimated_block(flight: Flight, scratch: Path, asked: MapSettings, steps: St
         ),
         flight,
     )
-    return replace(block, warnings=[*block.warnings, *(source_remarks(asked.calibration) if asked.calibration else [])])
 
 
 def stereo_cloud(block: Block, scratch: Path, asked: MapSettings, steps: Steps) -> Tiles:

@@ -24,7 +24,16 @@ from overfly.mapping.database import (
     read_verified,
     write_matches,
 )
-from overfly.mapping.encoder_matches import Picture, Prior, apart, by_priors, match_pair, overlay, picture
+from overfly.mapping.encoder_matches import (
+    Picture,
+    Prior,
+    apart,
+    by_priors,
+    match_pair,
+    overlay,
+    picture,
+    quarter_turns,
+)
 from overfly.mapping.features import MOST_PARTNERS, SMALL_FLIGHT, features, image_pairs, nearest_pairs
 from overfly.networks.encoder import Encoder
 
@@ -33,9 +42,6 @@ Pairs = list[tuple[int, int]]
 Matches = dict[tuple[int, int], NDArray[np.uint32]]
 
 MATCHERS = ("auto", "sift", "encoder", "both")
-
-TRUSTED = 4
-"""Pairs that lie as their priors say, from which on the others are believed to."""
 
 PICTURES = 24
 """Frames that are held in memory at once."""
@@ -147,18 +153,19 @@ def encoder_matches(
     def look(k: int) -> Picture:
         return picture(encoder, frames[k].image(), priors[k])
 
-    trusted = 0
+    proven: set[int] = set()
 
     def lying(i: int, j: int) -> Array | None:
-        """How frame j lies on frame i: where priors have told it often, nothing else is tried."""
-        nonlocal trusted
-        if apart(priors[i], priors[j]):
-            return None
+        """How frame j lies on frame i: where both have matched as their priors say, nothing else is tried."""
         told = by_priors(look(i), look(j))
+        sure = bool(told) and {i, j} <= proven
+        if sure and apart(priors[i], priors[j]):
+            return None
         found = overlay(encoder, look(i), look(j), told) if told else None
-        trusted += found is not None
-        if found is None and (trusted < TRUSTED or not told):
-            return overlay(encoder, look(i), look(j))
+        if found is not None:
+            proven.update((i, j))
+        elif not sure:
+            found = overlay(encoder, look(i), look(j), quarter_turns(look(i), look(j)))
         return found
 
     pixels = [[look(k).points] for k in range(len(frames))]

@@ -18,7 +18,7 @@ HALF_LINKED, SOFTNESS = 0.15, 0.03
 """Shared usable ground at which two images are linked in half of the cases, and how fast this changes: the first by
 thirty rendered flights, most of them spoilt; ``benchmarks/registration.py`` measures it on others."""
 
-FACING_DEG, APART_DEG = 15.0, 35.0
+FACING_DEG, APART_DEG = 20.0, 50.0
 """Between views that differ by less than the first, overlap alone decides; by more than the second nothing matches."""
 
 
