@@ -50,7 +50,7 @@ def fly(
     ] = None,
     frames: Annotated[int | None, typer.Option(help="At most so many frames.")] = None,
     seed: Annotated[int, typer.Option(help="Of the landscape, the light and the noise.")] = 0,
-    noise: Annotated[str, typer.Option(help="Of GPS and gimbal in the images: none, gps, rtk, ...")] = "none",
+    noise: Annotated[str, typer.Option(help="Of GPS and gimbal in the images: none, gps or rtk.")] = "none",
     processes: Annotated[int, typer.Option(help="That render side by side.")] = 1,
 ) -> None:
     """Photograph a landscape whose geometry is known: a flight folder with exact cameras and a reference cloud."""
@@ -216,7 +216,7 @@ def refine(
     generator: Annotated[str, typer.Option(help="vertices (each is free) or network (over them).")] = "vertices",
     width: Annotated[int, typer.Option(help="At which photographs are compared, pixels.")] = 1024,
     faces: Annotated[int, typer.Option(help="Of the refined mesh, about.")] = 200_000,
-    hold_out: Annotated[int, typer.Option(help="Every so manieth photograph is only measured on; 0: none.")] = 6,
+    hold_out: Annotated[int, typer.Option(help="One photograph out of so many is only measured on; 0: none.")] = 6,
     adversarial: Annotated[
         float | None, typer.Option("--lambda", help="Weight of the critic; 0: none. Default: as in conf/loss.")
     ] = None,

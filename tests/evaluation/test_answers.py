@@ -24,6 +24,11 @@ def windows(count: int = 2, **changes: int) -> dict[str, Tensor]:
     return batch
 
 
+def test_without_training_windows_their_two_answers_are_left_out() -> None:
+    answers = Baselines(None, Network(make_network(size=[WIDTH, HEIGHT]), WIDTH), 256)(windows())
+    assert list(answers) == [FLAT, "correlation sweep", "semi-global stereo", FLOOR, "floor: second sample"]
+
+
 def test_every_baseline_answers_with_a_cloud_and_a_surface() -> None:
     batch = windows()
     answers = Baselines([windows(seed=1), batch], Network(make_network(size=[WIDTH, HEIGHT]), WIDTH), 256)(batch)

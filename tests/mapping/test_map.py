@@ -240,6 +240,15 @@ def test_a_folder_with_another_map_is_not_overwritten_unasked(tmp_path: Path) ->
     assert not (first / "work").exists()
 
 
+def test_a_map_that_was_refused_leaves_its_folder_free(tmp_path: Path) -> None:
+    first, second, out = make_flight(tmp_path / "a"), make_flight(tmp_path / "b", 3), tmp_path / "out"
+    with pytest.raises(InputError, match="would not be used"):
+        mapped(first, out, calibration=str(first))
+    assert mapped(second, out)["images"] == 3
+    with pytest.raises(InputError, match="map of another flight"):
+        mapped(first, out)
+
+
 def test_a_moved_flight_is_still_the_same(tmp_path: Path) -> None:
     flight, out = make_flight(tmp_path / "f"), tmp_path / "out"
     mapped(flight, out)

@@ -54,7 +54,7 @@ class PhotographModule(L.LightningDataModule):
         cameras: auto, given or estimate.
         reference: a true cloud in the frame of the cameras; None: the flight's own, if it has one.
         width: of the photographs, pixels; larger ones are reduced.
-        hold_out: every so manieth photograph is only measured on, 0 for none.
+        hold_out: one photograph out of so many is only measured on, 0 for none.
         batch_size: photographs of a step.
         seed: of everything that is drawn.
         work: folder for the steps of aligning and stereo.
