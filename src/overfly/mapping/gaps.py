@@ -21,11 +21,11 @@ SOURCES = {MEASURED: "measured", PREDICTED: "predicted", INTERPOLATED: "interpol
 
 PALETTE = {
     0: (0, 0, 0, 0),
-    MEASURED: (60, 140, 70, 255),
-    PREDICTED: (240, 180, 40, 255),
-    INTERPOLATED: (200, 60, 50, 255),
+    MEASURED: (92, 176, 153, 255),
+    PREDICTED: (242, 158, 69, 255),
+    INTERPOLATED: (90, 80, 140, 255),
 }
-"""Colours in which ``dsm_source.tif`` opens."""
+"""Colours in which ``dsm_source.tif`` opens: those of the report, told apart by eyes that mix red and green, too."""
 
 NODATA = -9999.0
 
