@@ -147,7 +147,7 @@ def test_the_reference_has_a_point_for_each_ground_pixel_within_limits(tmp_path,
     monkeypatch.setattr("overfly.flights.launch.write_reference", lambda *arguments: wanted.append(arguments[3]))
     monkeypatch.setattr("overfly.flights.launch.REFERENCE", (10, 10_000_000))
     options = SMALL | {"frames": 3, "reference_points": None}
-    plan, _ = fly(scene, out=tmp_path / "a", seed=3, **options)
+    fly(scene, out=tmp_path / "a", seed=3, **options)
     assert 96 * 72 < wanted[0] < 3 * 96 * 72  # three images of that size, which overlap
     monkeypatch.setattr("overfly.flights.launch.REFERENCE", (10, 500))
     fly(scene, out=tmp_path / "b", seed=3, **options)
