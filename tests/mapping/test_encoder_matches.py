@@ -18,8 +18,9 @@ from overfly.geometry import fit_similarity, project, transform
 from overfly.losses import correspondence
 from overfly.mapping.align import align, gps_frame
 from overfly.mapping.correlate import refine
-from overfly.mapping.encoder_matches import Prior, apart, match_pair, overlay, picture
+from overfly.mapping.encoder_matches import match_pair, overlay, picture
 from overfly.mapping.matches import encoder_matches, priors
+from overfly.mapping.overlays import Prior, apart
 from overfly.mapping.settings import MapSettings
 from overfly.networks.encoder import Encoder
 from overfly.networks.matching import cell_pixels

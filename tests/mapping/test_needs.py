@@ -10,7 +10,8 @@ import pytest
 
 from overfly.errors import InputError
 from overfly.geometry import Camera
-from overfly.mapping.map import check_memory, memory_budget
+from overfly.mapping.dense import memory_budget
+from overfly.mapping.map import check_memory
 from overfly.mapping.needs import (
     HELD_MAPS,
     TILE_POINTS,

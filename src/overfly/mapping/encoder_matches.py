@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from overfly.geometry import Array, Camera, invert
+from overfly.geometry import Array
 from overfly.mapping.correlate import refine
+from overfly.mapping.overlays import Prior, by_priors, quarter_turns
 from overfly.networks.encoder import MATCH_STRIDE, Encoder
 from overfly.networks.matching import cell_pixels, keypoints, nearest, nearest_around, sample
 
@@ -35,10 +36,6 @@ FEWEST = 15
 ENOUGH = 40
 """Coarse correspondences that agree by no chance: no other guess is better by much."""
 
-FARTHEST = 0.35
-"""How far from the edge of one picture, in its sizes, its priors may put the other one for both to be compared: GPS,
-relief and gimbals move what they see."""
-
 AGREEMENT = 0.75
 """Correlation of the full images from which on a correspondence counts."""
 
@@ -51,18 +48,6 @@ move by so much at 30 % overlap."""
 
 OFF_PX = 1.5
 """How far off a fine correspondence may be, pixels of the compared images."""
-
-
-class Prior(NamedTuple):
-    """Roughly where a frame was taken from.
-
-    Attributes:
-        camera: of the full image; its distortion is left out of account.
-        world_from_camera: [4, 4], metres, with the ground at z = 0.
-    """
-
-    camera: Camera
-    world_from_camera: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +84,11 @@ class Picture:
     octaves: tuple[Octave, Octave]
     points: Array
     prior: Prior | None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the full image."""
+        return self.gray.shape[1], self.gray.shape[0]
 
 
 class Correspondences(NamedTuple):
@@ -168,7 +158,7 @@ def overlay(encoder: Encoder, first: Picture, second: Picture, guesses: Sequence
     coarse, other = first.octaves[0], second.octaves[0]
     best, most = None, FEWEST - 1
     if guesses is None:
-        guesses = [*by_priors(first, second), *quarter_turns(first, second)]
+        guesses = [*by_priors(first.prior, second.prior), *quarter_turns(first.size, second.size)]
     for guess in guesses:
         if most >= ENOUGH:
             break
@@ -184,19 +174,6 @@ def overlay(encoder: Encoder, first: Picture, second: Picture, guesses: Sequence
             scale = np.diag([*coarse.scale, 1.0])
             best = guess @ scale @ np.vstack([affinity, [0, 0, 1]]) @ np.linalg.inv(scale)
     return best
-
-
-def apart(first: Prior | None, second: Prior | None) -> bool:
-    """Whether priors put the second picture clearly beside the first on level ground; False where one is unknown."""
-    if first is None or second is None:
-        return False
-    camera = second.camera
-    outline = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], float)
-    seen = np.column_stack([outline, np.ones(4)]) @ (_over_ground(first) @ np.linalg.inv(_over_ground(second))).T
-    if not (seen[:, 2] * np.sign(seen[:, 2].sum()) > 0).all():  # the horizon is in the picture
-        return False
-    at = seen[:, :2] / seen[:, 2:] / [first.camera.width, first.camera.height]
-    return bool((at.min(0) > 1 + FARTHEST).any() or (at.max(0) < -FARTHEST).any())
 
 
 @torch.no_grad()
@@ -258,31 +235,6 @@ def _mutual(
     inside = (np.abs(_moved(own, at) / second.image.shape[1::-1] - 0.5) < 0.5).all(1)
     index = np.flatnonzero(mutual & inside)
     return index, at[index] - margin
-
-
-def by_priors(first: Picture, second: Picture) -> list[Array]:
-    """How the second picture lies on the first by the ground plane between their priors, if both are known."""
-    if first.prior is None or second.prior is None:
-        return []
-    return [_over_ground(second.prior) @ np.linalg.inv(_over_ground(first.prior))]
-
-
-def quarter_turns(first: Picture, second: Picture) -> list[Array]:
-    """How the second picture may lie on the first, of which nothing is known: homographies, second from first."""
-    sizes = [np.array(item.gray.shape[::-1], float) for item in (first, second)]
-    zoom = sizes[1].max() / sizes[0].max()
-    guesses = []
-    for cosine, sine in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        turn = np.eye(3)
-        turn[:2, :2] = zoom * np.array([[cosine, -sine], [sine, cosine]])
-        turn[:2, 2] = sizes[1] / 2 - turn[:2, :2] @ sizes[0] / 2
-        guesses.append(turn)
-    return guesses
-
-
-def _over_ground(prior: Prior) -> Array:
-    """The homography [3, 3] from the ground (x, y, 1) to pixels."""
-    return np.asarray((prior.camera.matrix() @ invert(prior.world_from_camera)[:3])[:, [0, 1, 3]])
 
 
 def _moved(homography: Array, pixels: Array) -> Array:

@@ -24,17 +24,9 @@ from overfly.mapping.database import (
     read_verified,
     write_matches,
 )
-from overfly.mapping.encoder_matches import (
-    Picture,
-    Prior,
-    apart,
-    by_priors,
-    match_pair,
-    overlay,
-    picture,
-    quarter_turns,
-)
+from overfly.mapping.encoder_matches import Picture, match_pair, overlay, picture
 from overfly.mapping.features import MOST_PARTNERS, SMALL_FLIGHT, features, image_pairs, nearest_pairs
+from overfly.mapping.overlays import Prior, apart, by_priors, quarter_turns
 from overfly.networks.encoder import Encoder
 
 Bar = Callable[[str, str], AbstractContextManager[Callable[..., Any]]]
@@ -157,7 +149,7 @@ def encoder_matches(
 
     def lying(i: int, j: int) -> Array | None:
         """How frame j lies on frame i: where both have matched as their priors say, nothing else is tried."""
-        told = by_priors(look(i), look(j))
+        told = by_priors(priors[i], priors[j])
         sure = bool(told) and {i, j} <= proven
         if sure and apart(priors[i], priors[j]):
             return None
@@ -165,7 +157,7 @@ def encoder_matches(
         if found is not None:
             proven.update((i, j))
         elif not sure:
-            found = overlay(encoder, look(i), look(j), quarter_turns(look(i), look(j)))
+            found = overlay(encoder, look(i), look(j), quarter_turns(look(i).size, look(j).size))
         return found
 
     pixels = [[look(k).points] for k in range(len(frames))]
