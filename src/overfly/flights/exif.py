@@ -179,14 +179,13 @@ def _read_lens(
     if found is None or value("DewarpFlag") == 1:
         return
     numbers = [number(part) for part in found.group(1).split(",")]
-    middle = value("CalibratedOpticalCenterX"), value("CalibratedOpticalCenterY")
-    width, height = (2 * m if m else side for m, side in zip(middle, original, strict=True))
     if len(numbers) < 9 or any(n is None for n in numbers[:9]):
         facts.notes.append("unreadable DewarpData")
         return
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(n or 0) for n in numbers[:9])
-    width, height = width or 0.0, height or 0.0
-    if fx <= 0 or fy <= 0 or not width or not height or abs(width * facts.height / (height * facts.width) - 1) > SHAPE:
+    middle = value("CalibratedOpticalCenterX"), value("CalibratedOpticalCenterY")
+    width, height = (2 * m if m else side or 0.0 for m, side in zip(middle, original, strict=True))
+    if min(fx, fy, width, height) <= 0 or abs(width * facts.height / (height * facts.width) - 1) > SHAPE:
         return  # zeros of a camera that was never calibrated, or a part of the image
     lens = Camera(round(width), round(height), fx, fy, width / 2 + cx, height / 2 + cy, k1, k2, p1, p2, k3)
     if invertible(lens):
