@@ -65,7 +65,11 @@ def draw(rows: Sequence[Row], path: Path, *, networks: Sequence[str]) -> None:
     ordered = [name for name in names if name in shown]
     if ordered:
         figure.legend(
-            [shown[n] for n in ordered], ordered, loc="outside lower center", ncols=len(several) + (len(several) > 1), frameon=False
+            [shown[n] for n in ordered],
+            ordered,
+            loc="outside lower center",
+            ncols=len(several) + (len(several) > 1),
+            frameon=False,
         )
     figure.savefig(path, dpi=110)
 
