@@ -389,6 +389,18 @@ def test_command_writes_json_and_picture(tmp_path, good, monkeypatch, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_picture_that_cannot_be_drawn_is_a_note(tmp_path, monkeypatch, capsys):
+    nowhere, picture = write(tmp_path / "flight", grid((0,)), gps=False), tmp_path / "overlap.png"
+    monkeypatch.setattr("sys.argv", ["overfly", "check", str(nowhere), "--picture", str(picture)])
+    with pytest.raises(SystemExit) as done:
+        cli.main()
+    said = capsys.readouterr()
+    assert not done.value.code
+    assert "This flight can be mapped" in said.out
+    assert "overlap.png was not written: There is no overlap map without positions" in " ".join(said.err.split())
+    assert not picture.exists()
+
+
 def test_two_processes_see_the_same(flight, looks):
     twice = look_at_all([f.path for f in flight.frames[:3]], processes=2)
     assert [one.digest for one in twice] == [one.digest for one in looks[:3]]

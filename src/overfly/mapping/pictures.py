@@ -228,7 +228,7 @@ def origin_map(seen: Surface, *, unit: str = "m", width_in: float = 5.6) -> Imag
     axes.imshow(np.where(known, mixed * shade, 1.0), extent=seen.grid.extent, interpolation="nearest")
     for label, colour in (("measured in two or more images", "#5cb099"), ("predicted", "#f29e45")):
         axes.plot([], [], "s", color=colour, label=label)
-    axes.legend(loc="lower right", frameon=True, framealpha=0.85, edgecolor="none", fontsize=8)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)  # corners are what is predicted
     _furnish(axes, seen.grid, unit)
     return _drawn(figure)
 
