@@ -1,10 +1,41 @@
-"""Which sparse points tell how deep the surface lies."""
+"""Which points tell how deep the surface lies, and where it may be matched."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from overfly.mapping.depth_ranges import beside_others
+from overfly.geometry import Camera, pixel_grid, pose, rotation_from_gimbal, unproject
+from overfly.mapping.coarse import _confirmed
+from overfly.mapping.depth_ranges import beside_others, depth_ranges
+
+
+def test_an_oblique_frame_does_not_see_far_under_the_ground_before_it() -> None:
+    camera = Camera(80, 60, 60.0, 60.0, 40.0, 30.0)
+    ahead = pose(rotation_from_gimbal(0, -35), [0, 0, 50])
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-60, 60, 4000), rng.uniform(20, 250, 4000), rng.uniform(-1, 9, 4000)])
+    span = depth_ranges([camera], [ahead], points)[0]
+    assert span.low < -1
+    assert span.high > 9
+    depth = np.full((60, 80), span.far * 0.9, np.float32)  # the far end of the range, matched wrongly everywhere
+    z = unproject(pixel_grid(80, 60), depth, camera, ahead)[..., 2]
+    kept = span.between(depth, camera, ahead)
+    assert np.isnan(kept[40:]).all()  # the lower rows look at ground that is near
+    assert np.isfinite(kept[(z > -1) & (z < 9)]).all()
+    assert np.isnan(kept[z < -40]).all()
+
+
+def test_points_of_a_pair_that_other_pairs_contradict_are_left_out() -> None:
+    rng = np.random.default_rng(0)
+    plan = rng.uniform(0, 200, (1200, 2))
+    pair = np.repeat(np.arange(6), 200)
+    points = np.column_stack([plan, np.where(plan[:, 0] > 100, 40.0, 0.0) + rng.normal(0, 1, 1200)])  # a step
+    wrong = (pair == 2) & (rng.random(1200) < 0.7)
+    points[wrong, 2] = -130 + rng.normal(0, 2, wrong.sum())
+    stands = _confirmed(points, pair, 15.0)
+    assert not stands[wrong].any()
+    assert stands[~wrong].mean() > 0.85  # not those on the step
+    assert not _confirmed(points[:200], pair[:200], 15.0).any()  # one pair alone
 
 
 def test_points_far_below_or_above_those_around_them_are_left_out() -> None:

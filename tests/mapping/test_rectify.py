@@ -109,7 +109,7 @@ def test_two_wrong_points_of_a_frame_do_not_widen_its_depths(camera: Camera) -> 
     points = np.column_stack([np.random.default_rng(0).uniform(-15, 15, (60, 2)), np.zeros(60)])
     points[:2, 2] = 76.0, 70.0
     points[:2, :2] *= 0.02
-    nearest, middle, farthest = depth_ranges([camera], [down], points)[0]
-    assert middle == pytest.approx(80)
-    assert nearest > 70
-    assert farthest < 90
+    span = depth_ranges([camera], [down], points)[0]
+    assert span.middle == pytest.approx(80)
+    assert span.near > 70
+    assert span.far < 90

@@ -178,10 +178,11 @@ def test_depth_ranges_hold_the_points_and_fall_back_to_the_usual(strips, camera,
     points = hill.surface(camera, strips[0])[::12, ::12].reshape(-1, 3)
     away = strips[0].copy()
     away[0, 3] += 500
-    (low, middle, high), unseen = depth_ranges([camera, camera], [strips[0], away], points)
+    span, unseen = depth_ranges([camera, camera], [strips[0], away], points)
     depth = (points - strips[0][:3, 3]) @ strips[0][:3, 2]
-    assert low < depth.min() < middle < depth.max() < high
-    assert unseen == (low, middle, high)
+    assert span.near < depth.min() < span.middle < depth.max() < span.far
+    assert span.low < points[:, 2].min() < points[:, 2].max() < span.high
+    assert unseen == span
 
 
 def test_a_camera_of_another_size_is_scaled(hill, strips, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

@@ -5,19 +5,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, unproject
+from overfly.mapping.depth_ranges import beside_others
 from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities
 from overfly.mapping.rectify import ordered, rectify
 
 LONGEST_SIDE = 320
+DRAWN = 200
+"""Points of a pair."""
+
 PAIRS = 24
 """Frames of a short flight that are matched with their neighbours."""
 
 APART = 8
 """In a long flight every so manieth is: its ground may lie high here and low there."""
+
+BESIDE, ENOUGH, ROUNDS = 8, 6, 3
+"""Nearest points of other pairs that a point is compared with, how many of them must be about as high, and how often
+those that are not are taken away: pairs that look from two sides match half of their pixels wrongly, all in one place."""
+
+OFF = 0.15
+"""Share of the cameras' height that those may be off."""
 
 
 def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
@@ -57,9 +69,9 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
             ideal = cameras[0].undistorted()
             depth = depth_in_frame(match, ideal, poses[0], layout, right=False)
             rows, columns = np.nonzero(np.isfinite(depth))
-            if len(rows) < 200:
+            if len(rows) < DRAWN:
                 continue
-            pick = rng.choice(len(rows), 200, replace=False)
+            pick = rng.choice(len(rows), DRAWN, replace=False)
             rows, columns = rows[pick], columns[pick]
             pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
             found.append(unproject(pixels, depth[rows, columns], ideal, poses[0]))
@@ -69,9 +81,32 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
             "or map with --cameras estimate."
         )
     points = np.concatenate(found)
-    # Wrong matches are few and far: keep what lies among the others.
+    height = abs(float(np.median(centres[:, 2]) - np.median(points[:, 2])))
+    confirmed = _confirmed(points, np.repeat(np.arange(len(found)), DRAWN), OFF * height)
+    if confirmed.sum() >= DRAWN:
+        points = points[confirmed]
+        return points[beside_others(points, centres)]
+    # Of one pair or two: keep what lies among the others.
     away = np.abs(points[:, 2] - np.median(points[:, 2]))
     return points[away <= 6 * np.median(away) + 1e-6]
+
+
+def _confirmed(points: Array, pair: NDArray[np.intp], off: float) -> NDArray[np.bool_]:
+    """Which points [M, 3] have points of other pairs [M] beside them, in plan, that are about as high."""
+    from scipy.spatial import cKDTree
+
+    stands = np.ones(len(points), bool)
+    for _ in range(ROUNDS):
+        before = stands.copy()
+        for one in np.unique(pair):
+            own, others = np.flatnonzero(before & (pair == one)), points[before & (pair != one)]
+            if len(others) < BESIDE or not len(own):
+                stands[own] = False
+                continue
+            _, beside = cKDTree(others[:, :2]).query(points[own, :2], k=BESIDE)
+            alike = np.abs(others[beside, 2] - points[own, 2, None]) < off
+            stands[own] = alike.sum(1) >= ENOUGH
+    return stands
 
 
 def _small(frame: Frame) -> Camera:

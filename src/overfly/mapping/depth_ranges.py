@@ -1,14 +1,15 @@
-"""How near and how far the surface lies from each frame, by surface points: the range that pairs are matched in."""
+"""How near, how far and how high the surface lies in each frame, by surface points: where pairs may match it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from overfly.errors import InputError
-from overfly.geometry import Array, Camera, project
+from overfly.geometry import Array, Camera, pixel_grid, project, rays
 from overfly.mapping.culling import Groups
 
 STRAYS = 2.5
@@ -26,25 +27,55 @@ BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
 
-def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[tuple[float, float, float]]:
-    """Nearest, median and farthest depth of each frame's surface, with margins, from surface points [M, 3].
+UNDER, OVER = (0.3, 0.04), (0.5, 0.08)
+"""Room below and above the points' heights, as shares of their range and of the median depth: key points are rare in
+pits, on ridges of roofs and on tree tops."""
 
-    Frames with too few points inside them take the usual depths of the frames beside them.
+
+class Span(NamedTuple):
+    """Where the surface lies in a frame: depths along its axis and heights in z, with margins, metres."""
+
+    near: float
+    middle: float
+    far: float
+    low: float
+    high: float
+
+    def between(self, depth: NDArray[np.float32], camera: Camera, world_from_camera: Array) -> NDArray[np.float32]:
+        """The depths [H, W] of an undistorted frame whose place is neither too low nor too high; NaN for the others.
+
+        An oblique frame looks far at its top and near at its bottom: its range of depths alone reaches deep under the
+        ground there, where wrong matches lie.
+        """
+        rise = (rays(pixel_grid(camera.width, camera.height), camera) @ world_from_camera[2, :3]).astype(np.float32)
+        height = np.float32(world_from_camera[2, 3]) + rise * depth
+        with np.errstate(invalid="ignore"):
+            return np.where((height > self.low) & (height < self.high), depth, np.float32(np.nan))
+
+
+def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[Span]:
+    """Where the surface lies in each frame, with margins, from surface points [M, 3].
+
+    Frames with too few points inside them take what is usual in the frames beside them.
     """
     groups = Groups(points)
-    found: list[tuple[float, float, float] | None] = []
+    found: list[Span | None] = []
     for camera, pose in zip(cameras, poses):
-        pixels, depth = project(groups.points[groups.near(camera, pose)], camera, pose)
+        near = groups.points[groups.near(camera, pose)]
+        pixels, depth = project(near, camera, pose)
         with np.errstate(invalid="ignore"):
             inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
         if inside.sum() < 20:
             found.append(None)
             continue
         rare = max(0.005, STRAYS / int(inside.sum()))
-        low, middle, high = np.quantile(depth[inside], [rare, 0.5, 1 - rare])
+        first, middle, last = np.quantile(depth[inside], [rare, 0.5, 1 - rare]).tolist()
         # Roofs and tree tops have few key points: leave room above.
-        margin = 0.15 * (high - low) + 0.02 * middle
-        found.append((max(low - 1.5 * margin, 0.05 * middle), float(middle), float(high + margin)))
+        margin = 0.15 * (last - first) + 0.02 * middle
+        bottom, top = np.quantile(near[inside, 2], [rare, 1 - rare]).tolist()
+        low, high = (share * (top - bottom) + more * middle for share, more in (UNDER, OVER))
+        near_end = max(first - 1.5 * margin, 0.05 * middle)
+        found.append(Span(near_end, middle, last + margin, bottom - low, top + high))
     known = np.flatnonzero([f is not None for f in found])
     if not len(known):
         raise InputError(
@@ -56,8 +87,7 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
     for i, own in enumerate(found):
         if own is None:
             away = np.linalg.norm(centres[known] - centres[i], axis=1)
-            low, middle, high = np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0)
-            own = (float(low), float(middle), float(high))
+            own = Span(*np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0).tolist())
         settled.append(own)
     return settled
 

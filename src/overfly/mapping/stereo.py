@@ -23,7 +23,7 @@ from overfly.geometry import Array, Camera, unproject
 from overfly.mapping.coarse import coarse_points
 from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_map import DepthMap, Map, Opinion
-from overfly.mapping.depth_ranges import depth_ranges
+from overfly.mapping.depth_ranges import Span, depth_ranges
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.neighbours import choose_partners
 from overfly.mapping.rectify import Rectified, ordered, rectify
@@ -85,7 +85,7 @@ def stereo(
     ranges = depth_ranges(flight.full, flight.poses, surface)
     ask = None if opinions is None else opinions(flight, surface)
     partners = choose_partners(
-        flight.full, flight.poses, [r[1] for r in ranges], count=neighbours, ratio=BASE_TO_HEIGHT
+        flight.full, flight.poses, [span.middle for span in ranges], count=neighbours, ratio=BASE_TO_HEIGHT
     )
     pairs = sorted({(min(i, j), max(i, j)) for i, chosen in enumerate(partners) for j in chosen})
     if not pairs:
@@ -176,19 +176,19 @@ def _pair_file(workdir: Path, pair: tuple[int, int]) -> Path:
 
 
 def _layout(
-    flight: Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]]
+    flight: Views, pair: tuple[int, int], ranges: list[Span]
 ) -> tuple[int, int, Rectified | None]:
     """Left frame, right frame and their rectification, None where it is not possible."""
     i, j = pair if ordered((flight.poses[pair[0]], flight.poses[pair[1]])) else pair[::-1]
     layout = rectify(
         (flight.matched_lens[i], flight.matched_lens[j]),
         (flight.poses[i], flight.poses[j]),
-        ((ranges[i][0], ranges[i][2]), (ranges[j][0], ranges[j][2])),
+        ((ranges[i].near, ranges[i].far), (ranges[j].near, ranges[j].far)),
     )
     return i, j, layout
 
 
-def _match(flight: Views, pair: tuple[int, int], ranges: list[tuple[float, float, float]], workdir: Path) -> None:
+def _match(flight: Views, pair: tuple[int, int], ranges: list[Span], workdir: Path) -> None:
     """Match a pair and keep the left canvas's disparities; an empty file where nothing can be matched."""
     i, j, layout = _layout(flight, pair, ranges)
     found = np.zeros((0, 0), np.int16)
@@ -230,7 +230,7 @@ def _depth(
     i: int,
     pairs: list[tuple[int, int]],
     chosen: list[int],
-    ranges: list[tuple[float, float, float]],
+    ranges: list[Span],
     workdir: Path,
     path: Path,
     ask: Opinions | None,
@@ -247,7 +247,7 @@ def _depth(
             continue
         seen = match if left == i else right_disparities(match)
         depth = depth_in_frame(seen, flight.matched[i], flight.poses[i], layout, right=left != i)
-        depths.append(depth)
+        depths.append(ranges[i].between(depth, flight.matched[i], flight.poses[i]))
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
     small = flight.matched[i]
     shape = small.height, small.width
