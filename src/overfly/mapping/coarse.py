@@ -26,7 +26,7 @@ APART = 8
 
 BESIDE, ENOUGH, ROUNDS = 8, 6, 3
 """Nearest points of other pairs that a point is compared with, how many of them must be about as high, and how often
-those that are not are taken away: pairs that look from two sides match half of their pixels wrongly, all in one place."""
+those that are not are taken away: pairs that look from two sides match half of their pixels wrongly, side by side."""
 
 OFF = 0.15
 """Share of the cameras' height that those may be off."""

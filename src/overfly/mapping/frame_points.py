@@ -7,12 +7,14 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.cloud import Cloud
+from overfly.cloud import Cloud, concatenate
 from overfly.flights import Frame
 from overfly.geometry import unproject
 from overfly.mapping.compared import Partner, compared
 from overfly.mapping.depth_map import DepthMap, Opinion
 from overfly.mapping.subpixel import Map
+from overfly.mapping.thinning import WALL
+from overfly.mapping.walls import CONFIDENCE, SIGMA, wall_points
 
 WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
@@ -167,9 +169,28 @@ def frame_points(
         views=(1 + votes[fresh]).astype(np.uint8),
         predicted=alone[fresh],
     )
+    cloud, apart = _with_walls(cloud, apart[fresh], np.where(known, seen.depth, np.float32(np.nan)), second, own, image)
     measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
     gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
-    return cloud, apart[fresh], known, gsd
+    return cloud, apart, known, gsd
+
+
+def _with_walls(
+    cloud: Cloud, apart: NDArray[np.uint8], depth: Map, second: NDArray[np.bool_], own: DepthMap, image: NDArray
+) -> tuple[Cloud, NDArray[np.uint8]]:
+    """The points of a frame, and what it shows of walls that nobody has matched."""
+    points, rows, columns = wall_points(depth, ~second, own.camera, own.world_from_camera)
+    n = len(points)
+    gsd = np.linalg.norm(points - own.world_from_camera[:3, 3], axis=1) / own.camera.fx
+    walls = Cloud(
+        points,
+        image[rows, columns],
+        confidence=np.full(n, CONFIDENCE, np.float32),
+        sigma_m=(SIGMA * gsd).astype(np.float32),
+        views=np.ones(n, np.uint8),
+        predicted=np.ones(n, bool),
+    )
+    return concatenate([cloud, walls]), np.concatenate([apart, np.full(n, WALL, np.uint8)])
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -64,7 +64,8 @@ def fuse(
     Returns:
         Tiles in ``workdir/tiles``: points with colour; ``views``, the frames that measured them (2 or more; 1 if
         predicted); ``sigma_m``, their standard deviation along the ray; ``confidence``, the share of such points that
-        was found right; ``predicted``, the word of a network alone, kept where nothing was matched near.
+        was found right; ``predicted``, the word of a network alone, kept where nothing was matched near, and walls
+        that one frame shows between a measured roof and measured ground (:mod:`overfly.mapping.walls`).
 
     Raises:
         InputError: the maps hold no depth at all.

@@ -175,9 +175,7 @@ def _pair_file(workdir: Path, pair: tuple[int, int]) -> Path:
     return workdir / f"pair-{pair[0]:05d}-{pair[1]:05d}.npy"
 
 
-def _layout(
-    flight: Views, pair: tuple[int, int], ranges: list[Span]
-) -> tuple[int, int, Rectified | None]:
+def _layout(flight: Views, pair: tuple[int, int], ranges: list[Span]) -> tuple[int, int, Rectified | None]:
     """Left frame, right frame and their rectification, None where it is not possible."""
     i, j = pair if ordered((flight.poses[pair[0]], flight.poses[pair[1]])) else pair[::-1]
     layout = rectify(

@@ -1,0 +1,95 @@
+"""Walls between a measured roof and the measured ground before it, and none under anything else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from overfly.cloud import Cloud
+from overfly.geometry import Array, Camera, pixel_grid, pose, rays, rotation_from_gimbal
+from overfly.mapping.thinning import BLOCK, WALL, thinned_tile
+from overfly.mapping.walls import wall_points
+
+CAMERA = Camera(400, 300, 300.0, 300.0, 200.0, 150.0)
+DOWN = pose(rotation_from_gimbal(0, -90), [0, 0, 75])  # a ground pixel is 25 cm
+EAST, WEST, NORTH, SOUTH = 22.0, 8.0, 7.0, -7.0
+
+
+def house(height: float = 10.0, rough: float = 0.0, size: float = 1.0) -> NDArray[np.float32]:
+    """Depth [H, W] of level ground and a house east of the camera: its west wall is seen and not matched."""
+    east = WEST + size * (EAST - WEST)
+    cast = rays(pixel_grid(400, 300), CAMERA) @ DOWN[:3, :3].T  # one metre along the axis is one metre down
+
+    def on(x: Array, y: Array) -> NDArray[np.bool_]:
+        return np.asarray((x > WEST) & (x < east) & (y > SOUTH * size) & (y < NORTH * size))
+
+    roof, ground = 75 - height, 75.0
+    over = on(*(cast[..., i] * roof for i in (0, 1)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        down = WEST / cast[..., 0]  # depth where the ray comes to the west wall
+    at_wall = (down > roof) & (down < ground) & (np.abs(cast[..., 1] * down) < NORTH * size)
+    depth = np.where(over, roof, np.where(at_wall, np.nan, ground))
+    depth[over] += np.random.default_rng(0).normal(0, rough, over.sum()) if rough else 0
+    return depth.astype(np.float32)
+
+
+def test_the_wall_that_an_image_shows_is_found_where_it_is() -> None:
+    depth = house()
+    points, rows, columns = wall_points(depth, np.isfinite(depth), CAMERA, DOWN)
+    assert len(points) > 1000
+    assert np.abs(points[:, 0] - WEST).max() < 0.8  # the west wall, and none of those that look away
+    assert points[:, 1].min() == pytest.approx(SOUTH, abs=0.8)
+    assert points[:, 1].max() == pytest.approx(NORTH, abs=0.8)
+    assert points[:, 2].min() == pytest.approx(0, abs=0.3)
+    assert points[:, 2].max() == pytest.approx(10, abs=0.3)
+    cells = np.unique(np.floor(points[:, 1:] / 0.5), axis=0)
+    assert len(cells) > 0.9 * 28 * 20  # without gaps
+    assert np.isnan(depth[rows, columns]).mean() > 0.8  # where the image shows it
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [({"height": 2.0}, "a hedge"), ({"rough": 2.0}, "a crown"), ({"size": 0.15}, "a shed")],
+)
+def test_nothing_stands_under_what_is_no_house(options: dict[str, float], why: str) -> None:
+    depth = house(**options)
+    assert not len(wall_points(depth, np.isfinite(depth), CAMERA, DOWN)[0]), why
+
+
+def test_a_guess_beside_a_roof_is_no_ground() -> None:
+    """At the border of what two images share a roof ends because nobody has matched the rest of it."""
+    depth = house()
+    guessed = np.isfinite(depth)
+    guessed[:, :235] = False  # all ground before the wall
+    assert not len(wall_points(depth, guessed, CAMERA, DOWN)[0])
+    assert not len(wall_points(np.full_like(depth, np.nan), guessed, CAMERA, DOWN)[0])
+
+
+def test_a_wall_is_cut_off_by_what_stands_before_it() -> None:
+    depth = house()
+    west, column = 195.0, np.arange(400)
+    before = (column > west) & (column < 240)
+    depth[:, before] = np.where(np.isnan(depth[:, before]), 60, depth[:, before])  # a screen, nearer than the wall
+    points, *_ = wall_points(depth, np.isfinite(depth), CAMERA, DOWN)
+    open_ = house()
+    assert len(points) < 0.3 * len(wall_points(open_, np.isfinite(open_), CAMERA, DOWN)[0])
+
+
+def test_a_point_on_a_wall_stands_under_the_roof_and_gives_way_to_what_was_matched() -> None:
+    low, high = np.zeros(2, np.int64), np.full(2, BLOCK)
+
+    def cloud(points: list[list[float]], predicted: bool) -> Cloud:
+        n = len(points)
+        return Cloud(
+            np.array(points), np.zeros((n, 3), np.uint8), confidence=np.full(n, 0.9, np.float32),
+            sigma_m=np.ones(n, np.float32), views=np.ones(n, np.uint8), predicted=np.full(n, predicted),
+        )  # fmt: skip
+
+    roof = [[10.5 + i % 3, 10.5 + i // 3, 30.5] for i in range(9)]
+    part = [[10.5, 10.5, 12.5 + i] for i in range(8)]  # of the wall, which was matched
+    walls = cloud([[10.5, 11.5, z + 0.5] for z in range(30)], True)
+    made = thinned_tile(cloud(roof + part, False), walls, np.full(30, WALL, np.uint8), 1.0, low, high)
+    assert made.predicted is not None
+    heights = np.sort(made.points[made.predicted, 2])
+    assert heights.tolist() == [z + 0.5 for z in range(30) if not 12 <= z < 20]
