@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from overfly.cloud import Cloud
 from overfly.geometry import Array, Camera, pixel_grid, pose, rays, rotation_from_gimbal
+from overfly.mapping import walls
+from overfly.mapping.raster import Grid, Surface
 from overfly.mapping.thinning import BLOCK, WALL, thinned_tile
 from overfly.mapping.walls import wall_points
 
@@ -93,3 +95,19 @@ def test_a_point_on_a_wall_stands_under_the_roof_and_gives_way_to_what_was_match
     assert made.predicted is not None
     heights = np.sort(made.points[made.predicted, 2])
     assert heights.tolist() == [z + 0.5 for z in range(30) if not 12 <= z < 20]
+
+
+def test_a_crown_that_is_flat_along_two_cells_is_no_roof(monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = Grid(0.0, 24.0, 0.4, 60, 60)
+    x, y = np.moveaxis(grid.centres() - 12, -1, 0)
+    clumps = 0.25 * (np.sin(2 * np.pi * x / 2.2) + np.cos(2 * np.pi * y / 2.2))
+    crown = np.where(np.hypot(x, y) < 6, 8 - (x**2 + y**2) / 14 + clumps, 0.0)
+    roof = np.where((np.abs(x) < 5) & (np.abs(y) < 5), 7 - 0.5 * np.abs(x), 0.0)  # a gable
+
+    def points(heights: Array) -> int:
+        return len(walls._curtains(Surface(grid, heights, None, np.ones((60, 60), np.int64)), 0.1)[0])
+
+    assert points(roof) > 10_000
+    assert points(crown) == 0
+    monkeypatch.setattr(walls, "LEVEL", 0.0)
+    assert points(crown) > 1000

@@ -30,11 +30,12 @@ AROUND, FIRM, ALIKE = 3, 10, 1.5
 """A cell stands firm where so many of those up to so many cells away are measured and differ by fewer cells."""
 
 FLAT_M, FLAT_PIXELS, PLANE = 0.12, 2, 2
-"""Root mean square, metres and ground pixels, whichever is more, by which cells up to so many away may miss a plane:
-those of roofs do, those of crowns do not."""
+"""Root mean square, metres and ground pixels, whichever is more, by which the cells up to so many away on a roof may
+miss a plane."""
 
-ROOF_M2 = 15.0
-"""Least plan of what a wall may stand under."""
+LEVEL, FAR_PLANE, ROOF_M2 = 0.5, 4, 20.0
+"""Share of a roof's cells that lie in a plane with those up to so many away, and least plan of a roof. Of the crowns of
+large trees, which are as flat as roofs along two cells (Tampa), hardly one has so many."""
 
 INWARD = 2
 """Ground pixels by which a wall stands inside the edge that was measured: matching carries roofs beyond their edges."""
@@ -48,9 +49,9 @@ TALLEST = 8.0
 SLACK = 4.0
 """Ground pixels by which what was matched must stand before a wall to hide it."""
 
-CONFIDENCE, SIGMA = 0.93, 2.6
+CONFIDENCE, SIGMA = 0.95, 2.5
 """Share of such points that lies within 1 % of the camera's height of a surface, and standard deviation across the wall
-in ground pixels, on six rendered flights over blocks, suburb, campus, village and wood."""
+in ground pixels, on rendered flights at 50 % over blocks, suburb, campus, village and wood."""
 
 
 def wall_points(
@@ -103,7 +104,9 @@ def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
     told = seen.filled if seen.predicted is None else seen.filled & ~(seen.predicted > 0.5)
     measured = np.where(told, seen.heights, np.nan)
     firm = _firm(measured, ALIKE * cell)
-    roof = _roofs(measured, firm & _flat(measured, cell, max(FLAT_M, FLAT_PIXELS * gsd)), ALIKE * cell, cell)
+    most = max(FLAT_M, FLAT_PIXELS * gsd)
+    flat, level = (firm & _flat(measured, cell, most, reach) for reach in (PLANE, FAR_PLANE))
+    roof = _roofs(measured, flat, level, ALIKE * cell, cell)
     margin = GAP + 1
     z = np.pad(seen.heights, margin, constant_values=np.nan)
     firm, roof = np.pad(firm, margin), np.pad(roof, margin)
@@ -138,11 +141,11 @@ def _firm(heights: Array, alike: float) -> NDArray[np.bool_]:
     return np.asarray(count >= FIRM)
 
 
-def _flat(heights: Array, cell: float, most: float) -> NDArray[np.bool_]:
-    """Cells that lie in a plane with those around them that may be of the same roof."""
+def _flat(heights: Array, cell: float, most: float, reach: int) -> NDArray[np.bool_]:
+    """Cells that lie in a plane with those up to so many away that may be of the same roof."""
 
     def of_the_roof() -> Iterator[tuple[Array, NDArray[np.bool_], int, int]]:
-        for beside, down, right in _shifted(heights, PLANE):
+        for beside, down, right in _shifted(heights, reach):
             with np.errstate(invalid="ignore"):  # slopes of 45 degrees and a little more
                 same = np.abs(beside - heights) < cell * (max(abs(down), abs(right)) + 2)
             yield np.where(same, beside - heights, 0.0), same, down, right
@@ -158,7 +161,7 @@ def _flat(heights: Array, cell: float, most: float) -> NDArray[np.bool_]:
     squares = np.zeros(heights.shape)
     for rise, same, down, right in of_the_roof():
         squares += np.where(same, rise - plane @ np.array([1.0, down, right]), 0.0) ** 2
-    return np.asarray((count >= 0.4 * (2 * PLANE + 1) ** 2) & (squares < most**2 * count))
+    return np.asarray((count >= 0.4 * (2 * reach + 1) ** 2) & (squares < most**2 * count))
 
 
 def _shifted(heights: Array, reach: int) -> Iterator[tuple[Array, int, int]]:
@@ -171,8 +174,10 @@ def _shifted(heights: Array, reach: int) -> Iterator[tuple[Array, int, int]]:
             yield padded[first : first + rows, left : left + columns], down, right
 
 
-def _roofs(heights: Array, flat: NDArray[np.bool_], alike: float, cell: float) -> NDArray[np.bool_]:
-    """The flat cells [rows, columns] that hang together in pieces as large as a roof."""
+def _roofs(
+    heights: Array, flat: NDArray[np.bool_], level: NDArray[np.bool_], alike: float, cell: float
+) -> NDArray[np.bool_]:
+    """The flat cells [rows, columns] that hang together in pieces as large and as ``level`` as a roof."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -186,8 +191,9 @@ def _roofs(heights: Array, flat: NDArray[np.bool_], alike: float, cell: float) -
     first, second = np.concatenate(ends, axis=1)
     graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(heights.size, heights.size))
     _, piece = connected_components(graph, directed=False)
-    large = np.bincount(piece, weights=flat.ravel()) * cell**2 >= ROOF_M2
-    return flat & large[piece].reshape(heights.shape)
+    size, of_planes = (np.bincount(piece, weights=part.ravel()) for part in (flat, flat & level))
+    roof = (size * cell**2 >= ROOF_M2) & (of_planes >= LEVEL * size)
+    return flat & roof[piece].reshape(heights.shape)
 
 
 def _ground(
