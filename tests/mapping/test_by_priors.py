@@ -13,7 +13,7 @@ from overfly.geometry import Array, Camera, fit_similarity, pose, project, rotat
 from overfly.mapping.bundle import Bundle, components
 from overfly.mapping.by_priors import bundle_by_priors
 from overfly.mapping.guided import guided_matches
-from overfly.mapping.placing import agrees_with_gps
+from overfly.mapping.placing import agrees_with_gps, placed, tilted
 
 CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
 SHOWN = 250
@@ -107,15 +107,15 @@ def test_a_bundle_that_contradicts_gps_is_told_from_one_that_is_only_off_by_some
     block = Block()
     found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
     assert found is not None
-    assert agrees_with_gps(found, block.told)
+    assert agrees_with_gps(found, block.told, block.frames)
     scaled = found.moved(np.diag([3.0, 3.0, 3.0, 1.0]))  # a similarity away
-    assert agrees_with_gps(scaled, block.told)
+    assert agrees_with_gps(scaled, block.told, block.frames)
     late = block.told + np.where(np.arange(8) < 4, 1, -1)[:, None] * [0.0, 5.0, 0.0]  # GPS lags on lines to and fro
-    assert agrees_with_gps(found, late)
+    assert agrees_with_gps(found, late, block.frames)
     folded = replace(found, centres=np.where(np.arange(8)[:, None] < 4, found.centres, found.centres[::-1]))
-    assert not agrees_with_gps(folded, block.told)
+    assert not agrees_with_gps(folded, block.told, block.frames)
     lost = replace(found, centres=found.centres + 300.0 * (np.arange(8) == 2)[:, None])
-    assert not agrees_with_gps(lost, block.told)
+    assert not agrees_with_gps(lost, block.told, block.frames)
 
 
 def test_guided_matches_are_the_right_ones() -> None:
@@ -180,3 +180,29 @@ def test_a_bundle_without_an_image() -> None:
     assert np.bincount(rest.point).min() >= 2
     np.testing.assert_array_equal(rest.centres, np.delete(found.centres, 2, 0))
     assert np.median(rest.errors()) < 0.5
+
+
+def test_an_image_that_is_tilted_otherwise_than_its_gimbal_contradicts_the_priors() -> None:
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    assert not tilted(found, block.frames).any()
+    leaning = rotation_from_gimbal(0, -60) @ rotation_from_gimbal(0, -90).T
+    rotations = found.rotations.copy()
+    rotations[3] = rotations[3] @ leaning.T
+    wrong = replace(found, rotations=rotations)
+    anywhere = np.eye(4)
+    anywhere[:3, :3] = rotation_from_gimbal(70, -20)  # whatever frame a sparse model stands in
+    assert np.flatnonzero(tilted(wrong.moved(anywhere), block.frames)).tolist() == [3]
+    assert not agrees_with_gps(wrong, block.told, block.frames)
+    warnings: list[str] = []
+    placed([wrong], block.frames, block.told, warnings)
+    assert [w for w in warnings if "1 images (3.jpg) are tilted by more than 20 degrees" in w]
+    # Headings the other way round, or gimbals that are wrong in every image, prove nothing.
+    reversed_ = [
+        replace(f, gimbal=(f.gimbal[0] + 180 * (k < 3), *f.gimbal[1:])) for k, f in enumerate(block.frames) if f.gimbal
+    ]
+    assert not tilted(found, reversed_).any()
+    spread = [replace(f, gimbal=(0.0, -90.0 + 20 * k, 0.0)) for k, f in enumerate(block.frames)]
+    assert not tilted(found, spread).any()
+    assert not tilted(wrong, [replace(f, gimbal=None) for f in block.frames]).any()

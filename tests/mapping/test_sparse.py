@@ -116,7 +116,7 @@ def test_more_matches_are_asked_for_where_they_are_too_few(
         sparse, "mapped", lambda database, *_, **__: [p] if (p := by_database[database.name]) is not None else []
     )
     monkeypatch.setattr(sparse, "bundle_of", lambda model, _: model)
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, _: part.name != against)
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_: part.name != against)
     monkeypatch.setattr(sparse, "read_points", lambda database, _: (read.append(database.name), []))
     monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
     monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: PRIOR)

@@ -29,6 +29,10 @@ DISTORTED = 0.05
 LOST = 4.0
 """Times as far as most may be, at which a single image counts as lost."""
 
+TILTED_DEG, LEVEL_DEG, FEWEST_GIMBALS = 20.0, 5.0, 4
+"""An image whose vertical is so far from the gimbals' is placed wrongly, if half of so many at least are less far off.
+Headings are not asked: Brighton's gimbals tell those of one line the other way round."""
+
 UNKNOWN_M = 1e3
 """Standard deviation of a height of which nothing is known."""
 
@@ -83,6 +87,12 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
             if number == 0:
                 raise
             continue
+        if (wrong := tilted(part, frames)).any():
+            warnings.append(
+                f"{_some(wrong, own)} are tilted by more than {TILTED_DEG:.0f} degrees against what their gimbals say: "
+                "wrong matches have placed them, or these gimbals are wrong. Look at the picture of the block, and fly "
+                "with more overlap."
+            )
         clean = without_faults(part, places, own, warnings)
         if np.isnan(clean).sum() > np.isnan(places).sum() and np.isfinite(clean[:, :2]).all(1).sum() >= 2:
             part = part.moved(by_gps(part.centres, clean, gimbals, part.world_from_camera))
@@ -102,11 +112,14 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
     return Placed(bundle, places, sigmas, ups, apart=np.sort(numbers[len(done[0][0]) :]))
 
 
-def agrees_with_gps(bundle: Bundle, told: Array) -> bool:
+def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame]) -> bool:
     """Whether a bundle, brought to the flight's GPS positions [n, 3] by a similarity, comes near to most of them.
 
-    No image may be far away from its own: either its position is wrong, or it has been placed by wrong matches.
+    No image may be far away from its own, or tilted otherwise than its gimbal says: either what is told of it is wrong,
+    or it has been placed by wrong matches.
     """
+    if tilted(bundle, frames).any():
+        return False
     places = told[bundle.frames]
     try:
         moved = bundle.moved(by_gps(bundle.centres, places, [None] * len(bundle), bundle.world_from_camera))
@@ -116,6 +129,22 @@ def agrees_with_gps(bundle: Bundle, told: Array) -> bool:
     extent = float((np.nanmax(places[:, :2], axis=0) - np.nanmin(places[:, :2], axis=0)).max())
     usual = max(FAR_OFF_M, DISTORTED * extent)
     return float(np.nanmedian(away)) < usual and float(np.nanmax(away)) < LOST * usual
+
+
+def tilted(bundle: Bundle, frames: Sequence[Frame]) -> NDArray[np.bool_]:
+    """Which images of a bundle, in any frame of reference, are tilted otherwise than their gimbals say [k]."""
+    gimbals = [frames[i].gimbal for i in bundle.frames.tolist()]
+    known = np.array([gimbal is not None for gimbal in gimbals])
+    wrong = np.zeros(len(bundle), bool)
+    if known.sum() < FEWEST_GIMBALS:
+        return wrong
+    said = np.stack([rotation_from_gimbal(*gimbal)[2] for gimbal in gimbals if gimbal is not None])
+    ups = np.einsum("nij,nj->ni", bundle.world_from_camera[known], said)  # all alike, were there no errors
+    middle = np.median(ups, axis=0)
+    angles = np.rad2deg(np.arccos(np.clip(ups @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
+    if np.median(angles) < LEVEL_DEG:
+        wrong[known] = angles > TILTED_DEG
+    return wrong
 
 
 def far_off(distance: Array) -> NDArray[np.bool_]:

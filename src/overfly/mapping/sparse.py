@@ -69,7 +69,7 @@ def sparse_parts(
 
     def judged(parts: list[Bundle]) -> tuple[bool, bool]:
         """Whether parts agree with GPS, as far as it is known, and whether they are good enough."""
-        agree = bool(parts) and (told is None or agrees_with_gps(parts[0], told))
+        agree = bool(parts) and (told is None or agrees_with_gps(parts[0], told, flight.frames))
         return agree, agree and len(parts[0]) >= ENOUGH * len(names)
 
     best = built_up(workdir)
