@@ -28,6 +28,9 @@ BESIDE, ENOUGH, ROUNDS = 8, 6, 3
 """Nearest points of other pairs that a point is compared with, how many of them must be about as high, and how often
 those that are not are taken away: pairs that look from two sides match half of their pixels wrongly, side by side."""
 
+AROUND = 64
+"""Nearest points of all pairs among which those of others are looked for."""
+
 OFF = 0.15
 """Share of the cameras' height that those may be off."""
 
@@ -44,11 +47,14 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
 
     rng = np.random.default_rng(seed)
     centres = np.array([np.asarray(f.world_from_camera)[:3, 3] for f in frames])
-    found = []
+    found, tried = [], set()
     step = min(max(1, len(frames) // PAIRS), APART)
     for i in range(0, len(frames), step):
         near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")
         for j in [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]:
+            if (min(i, j), max(i, j)) in tried:
+                continue
+            tried.add((min(i, j), max(i, j)))
             pair = [frames[i], frames[j]]
             poses = [np.asarray(f.world_from_camera, float) for f in pair]
             if not ordered((poses[0], poses[1])):
@@ -95,18 +101,16 @@ def _confirmed(points: Array, pair: NDArray[np.intp], off: float) -> NDArray[np.
     """Which points [M, 3] have points of other pairs [M] beside them, in plan, that are about as high."""
     from scipy.spatial import cKDTree
 
-    stands = np.ones(len(points), bool)
+    left = np.arange(len(points))
     for _ in range(ROUNDS):
-        before = stands.copy()
-        for one in np.unique(pair):
-            own, others = np.flatnonzero(before & (pair == one)), points[before & (pair != one)]
-            if len(others) < BESIDE or not len(own):
-                stands[own] = False
-                continue
-            _, beside = cKDTree(others[:, :2]).query(points[own, :2], k=BESIDE)
-            alike = np.abs(others[beside, 2] - points[own, 2, None]) < off
-            stands[own] = alike.sum(1) >= ENOUGH
-    return stands
+        if len(left) <= AROUND:
+            return np.zeros(len(points), bool)
+        _, beside = cKDTree(points[left, :2]).query(points[left, :2], k=AROUND)
+        other = pair[left][beside] != pair[left, None]
+        asked = other & (np.cumsum(other, axis=1) <= BESIDE)
+        alike = np.abs(points[left, 2][beside] - points[left, 2, None]) < off
+        left = left[(asked & alike).sum(1) >= ENOUGH]
+    return np.isin(np.arange(len(points)), left)
 
 
 def _small(frame: Frame) -> Camera:

@@ -92,6 +92,7 @@ def _fused(block: Block, scratch: Path, asked: MapSettings, steps: Steps, opinio
             maps,
             block.frames,
             workdir=scratch,
+            walls=block.metric,
             tile_points=held.tile_points,
             held=held.held_maps,
             progress=update,

@@ -1,4 +1,4 @@
-"""How near, how far and how high the surface lies in each frame, by surface points: where pairs may match it."""
+"""How near, how far and how low the surface lies in each frame, by surface points: where pairs may match it."""
 
 from __future__ import annotations
 
@@ -27,36 +27,33 @@ BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
 
-UNDER, OVER = (0.3, 0.04), (0.5, 0.08)
-"""Room below and above the points' heights, as shares of their range and of the median depth: key points are rare in
-pits, on ridges of roofs and on tree tops."""
+UNDER = 0.3, 0.04
+"""Room below the points' heights, as shares of their range and of the median depth: key points are rare in pits."""
 
 
 class Span(NamedTuple):
-    """Where the surface lies in a frame: depths along its axis and heights in z, with margins, metres."""
+    """Where the surface lies in a frame, with margins, metres: depths along its axis and the lowest z."""
 
     near: float
     middle: float
     far: float
     low: float
-    high: float
 
-    def between(self, depth: NDArray[np.float32], camera: Camera, world_from_camera: Array) -> NDArray[np.float32]:
-        """The depths [H, W] of an undistorted frame whose place is neither too low nor too high; NaN for the others.
+    def not_under(self, depth: NDArray[np.float32], camera: Camera, world_from_camera: Array) -> NDArray[np.float32]:
+        """The depths [H, W] of an undistorted frame whose place is not too low; NaN for the others.
 
         An oblique frame looks far at its top and near at its bottom: its range of depths alone reaches deep under the
         ground there, where wrong matches lie.
         """
         rise = (rays(pixel_grid(camera.width, camera.height), camera) @ world_from_camera[2, :3]).astype(np.float32)
-        height = np.float32(world_from_camera[2, 3]) + rise * depth
         with np.errstate(invalid="ignore"):
-            return np.where((height > self.low) & (height < self.high), depth, np.float32(np.nan))
+            return np.where(rise * depth > self.low - world_from_camera[2, 3], depth, np.float32(np.nan))
 
 
 def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[Span]:
     """Where the surface lies in each frame, with margins, from surface points [M, 3].
 
-    Frames with too few points inside them take what is usual in the frames beside them.
+    Frames with too few points inside them take the depths that are usual in the frames beside them, and any height.
     """
     groups = Groups(points)
     found: list[Span | None] = []
@@ -73,9 +70,8 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
         # Roofs and tree tops have few key points: leave room above.
         margin = 0.15 * (last - first) + 0.02 * middle
         bottom, top = np.quantile(near[inside, 2], [rare, 1 - rare]).tolist()
-        low, high = (share * (top - bottom) + more * middle for share, more in (UNDER, OVER))
-        near_end = max(first - 1.5 * margin, 0.05 * middle)
-        found.append(Span(near_end, middle, last + margin, bottom - low, top + high))
+        low = bottom - UNDER[0] * (top - bottom) - UNDER[1] * middle
+        found.append(Span(max(first - 1.5 * margin, 0.05 * middle), middle, last + margin, low))
     known = np.flatnonzero([f is not None for f in found])
     if not len(known):
         raise InputError(
@@ -87,7 +83,8 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
     for i, own in enumerate(found):
         if own is None:
             away = np.linalg.norm(centres[known] - centres[i], axis=1)
-            own = Span(*np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0).tolist())
+            usual = np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0).tolist()
+            own = Span(*usual)._replace(low=-np.inf)  # the land may fall there
         settled.append(own)
     return settled
 

@@ -117,6 +117,7 @@ def frame_points(
     partners: Iterable[Partner],
     frame: Frame,
     single: bool,
+    walls: bool = False,
 ) -> tuple[Cloud, NDArray[np.uint8], NDArray[np.bool_], float]:
     """The points of one map that earlier maps have not given.
 
@@ -126,10 +127,11 @@ def frame_points(
             one, the pixels [H, W] that it has given.
         frame: it was made from, for the colours.
         single: keep points that only one pair has seen.
+        walls: add what the frame shows of walls that nobody has matched; the frame of reference is in metres.
 
     Returns:
-        The points; voxels [N] along the cell of the plan in which no matched point may be for them to stand, 0 for what
-        pairs have matched; which pixels are given now [H, W]; and metres per pixel.
+        The points; how far apart [N] from matched points they stand (:func:`overfly.mapping.thinning.thinned_tile`), 0
+        for what pairs have matched; which pixels are given now [H, W]; and metres per pixel.
     """
     depth: Map = data["depth"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
@@ -169,7 +171,10 @@ def frame_points(
         views=(1 + votes[fresh]).astype(np.uint8),
         predicted=alone[fresh],
     )
-    cloud, apart = _with_walls(cloud, apart[fresh], np.where(known, seen.depth, np.float32(np.nan)), second, own, image)
+    apart = apart[fresh]
+    if walls:
+        left = np.where(known, seen.depth, np.float32(np.nan))
+        cloud, apart = _with_walls(cloud, apart, np.where(shown, left, np.float32(np.inf)), second, own, image)
     measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
     gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
     return cloud, apart, known, gsd
@@ -179,7 +184,7 @@ def _with_walls(
     cloud: Cloud, apart: NDArray[np.uint8], depth: Map, second: NDArray[np.bool_], own: DepthMap, image: NDArray
 ) -> tuple[Cloud, NDArray[np.uint8]]:
     """The points of a frame, and what it shows of walls that nobody has matched."""
-    points, rows, columns = wall_points(depth, ~second, own.camera, own.world_from_camera)
+    points, rows, columns, voxels = wall_points(depth, ~second, own.camera, own.world_from_camera)
     n = len(points)
     gsd = np.linalg.norm(points - own.world_from_camera[:3, 3], axis=1) / own.camera.fx
     walls = Cloud(
@@ -190,7 +195,7 @@ def _with_walls(
         views=np.ones(n, np.uint8),
         predicted=np.ones(n, bool),
     )
-    return concatenate([cloud, walls]), np.concatenate([apart, np.full(n, WALL, np.uint8)])
+    return concatenate([cloud, walls]), np.concatenate([apart, np.full(n, WALL + voxels, np.uint8)])
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

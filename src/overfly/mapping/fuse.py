@@ -42,6 +42,7 @@ def fuse(
     workdir: Path,
     voxel_m: float | None = None,
     single: bool = True,
+    walls: bool = False,
     tile_points: int = TILE_POINTS,
     held: int = HELD,
     progress: Progress | None = None,
@@ -55,6 +56,8 @@ def fuse(
         workdir: parts and tiles are kept here; give one folder per set of depth maps and settings.
         voxel_m: at most one point per cube of this side; None takes the median ground sampling distance of the maps.
         single: keep points that only one pair has seen, with a low confidence. At 30 % overlap they are half the map.
+        walls: add what frames show of walls that nobody has matched (:mod:`overfly.mapping.walls`); the frame of
+            reference is in metres.
         tile_points: about as many points, before thinning, are in memory at once; the set of points that comes out
             does not depend on it.
         held: depth maps in memory at once.
@@ -64,13 +67,13 @@ def fuse(
     Returns:
         Tiles in ``workdir/tiles``: points with colour; ``views``, the frames that measured them (2 or more; 1 if
         predicted); ``sigma_m``, their standard deviation along the ray; ``confidence``, the share of such points that
-        was found right; ``predicted``, the word of a network alone, kept where nothing was matched near, and walls
-        that one frame shows between a measured roof and measured ground (:mod:`overfly.mapping.walls`).
+        was found right; ``predicted``, the word of a network alone, kept where nothing was matched near, or a
+        wall, whose ``sigma_m`` is across it.
 
     Raises:
         InputError: the maps hold no depth at all.
     """
-    fusion = _Fusion(depth_maps, frames, workdir, single, held)
+    fusion = _Fusion(depth_maps, frames, workdir, (single, walls), held)
     layout = Layout.read(workdir / "layout.json")
     if layout is None:
         parts = []
@@ -107,10 +110,15 @@ class _Fusion:
     """The points of frames, kept in a folder and made where they are not there."""
 
     def __init__(
-        self, depth_maps: Sequence[DepthMap], frames: Sequence[Frame], workdir: Path, single: bool, held: int
+        self,
+        depth_maps: Sequence[DepthMap],
+        frames: Sequence[Frame],
+        workdir: Path,
+        wanted: tuple[bool, bool],
+        held: int,
     ) -> None:
         workdir.mkdir(parents=True, exist_ok=True)
-        self.maps, self.workdir, self.single = depth_maps, workdir, single
+        self.maps, self.workdir, self.wanted = depth_maps, workdir, wanted
         self.frames = {frame.name: frame for frame in frames}
         self.index = {m.name: k for k, m in enumerate(depth_maps)}
         self.load = lru_cache(maxsize=held)(lambda k: cleaned(depth_maps[k]))
@@ -131,7 +139,7 @@ class _Fusion:
         """Work out the points of a frame and keep them, and which pixels it gives, for the frames after it."""
         own = self.maps[k]
         cloud, apart, given, gsd = frame_points(
-            own, self.load(k), self._partners(k), self.frames[own.name], self.single
+            own, self.load(k), self._partners(k), self.frames[own.name], *self.wanted
         )
         save_arrays(self._mask(k), {"bits": np.packbits(given), "shape": np.array(given.shape)})
         return write_part(self.path(k), cloud, apart, gsd)

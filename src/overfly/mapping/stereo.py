@@ -245,7 +245,7 @@ def _depth(
             continue
         seen = match if left == i else right_disparities(match)
         depth = depth_in_frame(seen, flight.matched[i], flight.poses[i], layout, right=left != i)
-        depths.append(ranges[i].between(depth, flight.matched[i], flight.poses[i]))
+        depths.append(ranges[i].not_under(depth, flight.matched[i], flight.poses[i]))
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
     small = flight.matched[i]
     shape = small.height, small.width

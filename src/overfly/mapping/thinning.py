@@ -23,9 +23,12 @@ LEAST_CONFIDENT = 0.33
 """Points that no pair has matched are left out with less confidence. At 0.4 precision is up to 0.05 higher, at 0.25
 recall; F-scores prefer the latter on rendered flights and the former on a real one."""
 
-WALL = 2
-"""What is ``apart`` of a point on a wall that was not matched: no matched point may be in its cell of so many voxels,
-in height too, since the roof above it is in its cell of the plan."""
+WALL = 128
+"""Added to ``apart`` of points on walls that were not matched: their cells have a height, too, since the roof above a
+wall is in its cell of the plan."""
+
+WALL_VOXELS = 2
+"""Voxels along a cube that holds at most one such point: frames place a wall a little apart."""
 
 BLOCK = 120
 """Voxels: tiles begin and end at multiples, at which the filters' cells do, too."""
@@ -43,21 +46,39 @@ def thinned_tile(
         matched: all points that pairs have matched in the tile and :data:`MARGIN` voxels around it, in a fixed order.
         guesses: all other points, of the tile alone.
         apart: voxels [N] along the cell of the plan, divisors of :data:`BLOCK`, in which a matched point makes a guess
-            needless; or :data:`WALL`.
+            needless; with :data:`WALL` those along a cube.
         size: side of a voxel.
         low, high: [2], the tile's first voxel and the one behind its last, multiples of :data:`BLOCK`.
     """
     first = matched[thinned(matched, size)]
     first = first[accompanied(first.points, size)]
     first = first[within(voxels(first.points, size), low, high)]
+    on_wall = apart >= WALL
+    others = _standing(guesses, np.flatnonzero(~on_wall), apart, size, size, [first.points])
+    walls = _standing(
+        guesses, np.flatnonzero(on_wall), apart, size, WALL_VOXELS * size, [first.points, guesses.points[others]]
+    )
+    return concatenate([first, guesses[others], guesses[walls]])
+
+
+def _standing(
+    guesses: Cloud,
+    asked: NDArray[np.intp],
+    apart: NDArray[np.uint8],
+    size: float,
+    cube: float,
+    before: list[NDArray[np.float64]],
+) -> NDArray[np.intp]:
+    """Numbers of the guesses among those asked that stand, at most one in a cube, beside the points that do already."""
     assert guesses.confidence is not None
-    chosen = thinned(guesses, size)
+    chosen = asked[thinned(guesses[asked], cube)]
     chosen = chosen[guesses.confidence[chosen] >= LEAST_CONFIDENT]
     stand = np.zeros(len(chosen), bool)
+    known = np.concatenate(before)
     for cells in np.unique(apart[chosen]):
         these = apart[chosen] == cells
-        stand[these] = _elsewhere(guesses.points[chosen[these]], first.points, size, int(cells))
-    return concatenate([first, guesses[chosen[stand]]])
+        stand[these] = _elsewhere(guesses.points[chosen[these]], known, size, int(cells))
+    return chosen[stand]
 
 
 def within(at: NDArray[np.int64], low: NDArray, high: NDArray) -> NDArray[np.bool_]:
@@ -107,8 +128,8 @@ def _elsewhere(guesses: NDArray, matched: NDArray, size: float, apart: int) -> N
     """Guessed points [N, 3] in whose cell of the plan nothing was matched: what is measured needs no guess."""
     if not len(guesses) or not len(matched):
         return np.ones(len(guesses), bool)
-    axes = 3 if apart == WALL else 2
-    cells = [voxels(points[:, :axes], size) // apart for points in (guesses, matched)]
+    axes = 3 if apart >= WALL else 2
+    cells = [voxels(points[:, :axes], size) // (apart % WALL) for points in (guesses, matched)]
     low, high = cells[0].min(0), cells[0].max(0)
     near = cells[1][((cells[1] >= low) & (cells[1] <= high)).all(1)]
     spans = high - low + 1

@@ -1,12 +1,10 @@
 """Walls that one image shows and no pair matches: between a roof's measured edge and the measured ground before it.
 
-A wall is seen from one side, at a flat angle, by few images: pairs find a quarter of it. What stands above and below it
+A wall is seen from one side, at a flat angle, by few images: pairs find a quarter to a half of it. What stands above and below it
 is measured, though, and between the two nothing else can be.
 """
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from overfly.cloud import Cloud
 from overfly.geometry import Array, Camera, project, unproject
 from overfly.mapping.raster import Surface, grid_over, surface
+from overfly.mapping.thinning import BLOCK
 
 Map = NDArray[np.float32]
 
@@ -37,48 +36,59 @@ LEVEL, FAR_PLANE, ROOF_M2 = 0.5, 4, 20.0
 """Share of a roof's cells that lie in a plane with those up to so many away, and least plan of a roof. Of the crowns of
 large trees, which are as flat as roofs along two cells (Tampa), hardly one has so many."""
 
+GROUND_M2 = 60.0
+"""Least plan of the ground before a wall: else a pit of wrong matches would get walls, too."""
+
 INWARD = 2
 """Ground pixels by which a wall stands inside the edge that was measured: matching carries roofs beyond their edges."""
 
-FARTHEST = 3.0
+FARTHEST = 2.0
 """Median depths beyond which an oblique image shows too little."""
+
+DIVISORS = tuple(size for size in range(2, 61) if BLOCK % size == 0)
+"""Sides of cubes, in voxels, that no border of a tile cuts."""
+
+PIXELS = 2
+"""Pixels along a cell that are looked at."""
+
+AT_ONCE = 20_000
+"""Cells whose planes are fitted at once."""
 
 TALLEST = 8.0
 """Ground pixels along the ray that one pixel shows of a wall: what lies farther is another wall, behind it."""
 
-SLACK = 4.0
-"""Ground pixels by which what was matched must stand before a wall to hide it."""
-
 CONFIDENCE, SIGMA = 0.95, 2.5
 """Share of such points that lies within 1 % of the camera's height of a surface, and standard deviation across the wall
-in ground pixels, on rendered flights at 50 % over blocks, suburb, campus, village and wood."""
+in ground pixels, on rendered flights at 50 % over blocks, campus and suburb."""
 
 
 def wall_points(
     depth: Map, measured: NDArray[np.bool_], camera: Camera, world_from_camera: Array
-) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[Array, NDArray[np.intp], NDArray[np.intp], int]:
     """Points on the walls that a frame shows in its blank pixels.
 
     Args:
-        depth: [H, W] of the frame, metres, NaN where blank.
+        depth: [H, W] of the frame, metres, NaN where blank, infinite where the lens shows nothing.
         measured: where pairs have matched it; elsewhere it is a guess, beside which no wall is told.
         camera: undistorted, of the same size.
         world_from_camera: [4, 4], z up.
 
     Returns:
-        Points [N, 3] a ground pixel apart, and the rows and columns [N] that show them.
+        Points [N, 3] a ground pixel apart, the rows and columns [N] that show them, and how many ground pixels wide the
+        cubes are in which other points make them needless.
     """
-    nothing = np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp)
-    known = np.isfinite(depth)
-    if not (known & measured).any():
+    nothing = np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp), 1
+    blank = np.isnan(depth)
+    if not (np.isfinite(depth) & measured).any():
         return nothing
-    middle = float(np.median(depth[known & measured]))
-    rows, columns = np.nonzero(known & (depth < FARTHEST * middle))
-    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
-    points = unproject(pixels, depth[rows, columns], camera, world_from_camera)
+    middle = float(np.median(depth[np.isfinite(depth) & measured]))
     gsd = middle / camera.fx
     cell = max(CELL_M, CELL_PIXELS * gsd)
-    seen = surface(Cloud(points, predicted=~measured[rows, columns]), grid_over(points, cell, trim=0.0005), fill=2)
+    step = max(1, int(cell / gsd / PIXELS))
+    rows, columns = (k * step for k in np.nonzero(depth[::step, ::step] < FARTHEST * middle))
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    points = unproject(pixels, depth[rows, columns], camera, world_from_camera)
+    seen = surface(Cloud(points, predicted=~measured[rows, columns]), grid_over(points, cell, trim=0.0005))
     found, outward = _curtains(seen, gsd)
     if not len(found):
         return nothing
@@ -88,14 +98,14 @@ def wall_points(
     column, row = np.floor(np.nan_to_num(at, nan=-1)).astype(np.intp).T
     inside = (away > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
     shown = np.flatnonzero(inside)
-    with np.errstate(invalid="ignore"):
-        shown = shown[~(depth[row[shown], column[shown]] < away[shown] - SLACK * gsd)]
+    shown = shown[blank[row[shown], column[shown]]]
     flat = row[shown] * camera.width + column[shown]
     nearest = np.full(camera.height * camera.width, np.inf)
     np.minimum.at(nearest, flat, away[shown])
     shown = shown[away[shown] < nearest[flat] + TALLEST * gsd]
     found[:, :2] -= INWARD * gsd * outward  # after it was looked for where its edge was seen
-    return found[shown], row[shown], column[shown]
+    voxels = next(size for size in DIVISORS if size >= cell / gsd - 1e-6 or size == DIVISORS[-1])
+    return found[shown], row[shown], column[shown], voxels
 
 
 def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
@@ -104,12 +114,10 @@ def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
     told = seen.filled if seen.predicted is None else seen.filled & ~(seen.predicted > 0.5)
     measured = np.where(told, seen.heights, np.nan)
     firm = _firm(measured, ALIKE * cell)
-    most = max(FLAT_M, FLAT_PIXELS * gsd)
-    flat, level = (firm & _flat(measured, cell, most, reach) for reach in (PLANE, FAR_PLANE))
-    roof = _roofs(measured, flat, level, ALIKE * cell, cell)
+    roof, ground = _roofs(measured, firm, cell, max(FLAT_M, FLAT_PIXELS * gsd))
     margin = GAP + 1
     z = np.pad(seen.heights, margin, constant_values=np.nan)
-    firm, roof = np.pad(firm, margin), np.pad(roof, margin)
+    roof, ground = np.pad(roof, margin), np.pad(ground, margin)
     parts = max(1, round(cell / gsd))  # points side by side on the border of a cell
     aside = ((np.arange(parts) + 0.5) / parts - 0.5) * cell
     points, ways = [np.zeros((0, 3))], [np.zeros((0, 2))]
@@ -117,10 +125,10 @@ def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
         with np.errstate(invalid="ignore"):
             edge = roof & ~(np.roll(z, (-down, -right), (0, 1)) > z - step)
         row, column = np.nonzero(edge)
-        ground = _ground(z, firm, row, column, (down, right), step)
-        held = np.isfinite(ground)
-        row, column, ground = row[held], column[held], ground[held]
-        count = ((z[row, column] - ground) / gsd).astype(np.intp)
+        foot = _foot(z, ground, row, column, (down, right), step)
+        held = np.isfinite(foot)
+        row, column, foot = row[held], column[held], foot[held]
+        count = ((z[row, column] - foot) / gsd).astype(np.intp)
         own = np.repeat(np.arange(len(row)), count)
         below = (np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count) + 0.5) * gsd
         x = seen.grid.x_min + (column - margin + 0.5 + 0.5 * right) * cell
@@ -134,50 +142,58 @@ def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
 
 def _firm(heights: Array, alike: float) -> NDArray[np.bool_]:
     """Cells with enough others around them that are about as high."""
+    padded = np.pad(heights, AROUND, constant_values=np.nan)
+    rows, columns = heights.shape
     count = np.zeros(heights.shape, np.uint8)
-    for beside, _, _ in _shifted(heights, AROUND):
-        with np.errstate(invalid="ignore"):
-            count += np.abs(beside - heights) < alike
+    with np.errstate(invalid="ignore"):
+        for down in range(2 * AROUND + 1):
+            for right in range(2 * AROUND + 1):
+                count += np.abs(padded[down : down + rows, right : right + columns] - heights) < alike
     return np.asarray(count >= FIRM)
 
 
-def _flat(heights: Array, cell: float, most: float, reach: int) -> NDArray[np.bool_]:
-    """Cells that lie in a plane with those up to so many away that may be of the same roof."""
-
-    def of_the_roof() -> Iterator[tuple[Array, NDArray[np.bool_], int, int]]:
-        for beside, down, right in _shifted(heights, reach):
-            with np.errstate(invalid="ignore"):  # slopes of 45 degrees and a little more
-                same = np.abs(beside - heights) < cell * (max(abs(down), abs(right)) + 2)
-            yield np.where(same, beside - heights, 0.0), same, down, right
-
-    sums = np.zeros((9, *heights.shape))
-    for rise, same, down, right in of_the_roof():
-        terms = (1, down, right, down * down, down * right, right * right)
-        sums[:6] += np.array(terms, float)[:, None, None] * same
-        sums[6:] += np.array([1, down, right], float)[:, None, None] * rise
-    count, y, x, yy, xy, xx, z, zy, zx = sums
-    normal = np.stack([count, y, x, y, yy, xy, x, xy, xx], axis=-1).reshape(*heights.shape, 3, 3) + 1e-6 * np.eye(3)
-    plane = np.linalg.solve(normal, np.stack([z, zy, zx], axis=-1)[..., None])[..., 0]
-    squares = np.zeros(heights.shape)
-    for rise, same, down, right in of_the_roof():
-        squares += np.where(same, rise - plane @ np.array([1.0, down, right]), 0.0) ** 2
-    return np.asarray((count >= 0.4 * (2 * reach + 1) ** 2) & (squares < most**2 * count))
-
-
-def _shifted(heights: Array, reach: int) -> Iterator[tuple[Array, int, int]]:
-    """The heights of the cells up to so many down and to the right of each, and how far."""
-    padded = np.pad(heights, reach, constant_values=np.nan)
-    rows, columns = heights.shape
-    for down in range(-reach, reach + 1):
-        for right in range(-reach, reach + 1):
-            first, left = reach + down, reach + right
-            yield padded[first : first + rows, left : left + columns], down, right
-
-
 def _roofs(
-    heights: Array, flat: NDArray[np.bool_], level: NDArray[np.bool_], alike: float, cell: float
-) -> NDArray[np.bool_]:
-    """The flat cells [rows, columns] that hang together in pieces as large and as ``level`` as a roof."""
+    heights: Array, firm: NDArray[np.bool_], cell: float, most: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Firm cells [rows, columns] of pieces as large and as flat as a roof, and of those as large as ground."""
+    flat = np.zeros(heights.shape, bool)
+    flat[firm] = _flat(heights, np.argwhere(firm), cell, most, PLANE)
+    piece, count = _pieces(heights, flat, ALIKE * cell)
+    size = np.bincount(piece.ravel(), weights=flat.ravel(), minlength=count) * cell**2
+    asked = flat & (size[piece] >= ROOF_M2)
+    asked[1::2] = asked[:, 1::2] = False  # every second row and column tell as much
+    level = _flat(heights, np.argwhere(asked), cell, most, FAR_PLANE)
+    of_all = np.bincount(piece[asked], minlength=count)
+    share = np.bincount(piece[asked], weights=level, minlength=count) / np.maximum(of_all, 1)
+    return flat & ((size >= ROOF_M2) & (share >= LEVEL))[piece], flat & (size >= GROUND_M2)[piece]
+
+
+def _flat(heights: Array, asked: NDArray[np.intp], cell: float, most: float, reach: int) -> NDArray[np.bool_]:
+    """Whether cells [N, 2] (row, column) lie in a plane with those up to so many away that may be of the same roof."""
+    steps = np.arange(-reach, reach + 1)
+    down, right = (part.ravel() for part in np.meshgrid(steps, steps, indexing="ij"))
+    base = np.stack([np.ones(len(down)), down, right], axis=1)
+    products = (base[:, :, None] * base[:, None]).reshape(-1, 9)
+    allowed = cell * (np.maximum(np.abs(down), np.abs(right)) + 2)  # slopes of 45 degrees and a little more
+    padded = np.pad(heights, reach, constant_values=np.nan)
+    found = np.zeros(len(asked), bool)
+    for start in range(0, len(asked), AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        r, c = asked[some].T
+        rise = padded[r[:, None] + reach + down, c[:, None] + reach + right] - heights[r, c][:, None]
+        with np.errstate(invalid="ignore"):
+            same = np.abs(rise) < allowed
+        rise = np.where(same, rise, 0.0)
+        count, right_side = same.sum(1), rise @ base
+        normal = (same @ products).reshape(-1, 3, 3) + 1e-6 * np.eye(3)
+        plane = np.linalg.solve(normal, right_side[:, :, None])[:, :, 0]
+        squares = (rise**2).sum(1) - (plane * right_side).sum(1)
+        found[some] = (count >= 0.4 * len(down)) & (squares < most**2 * count)
+    return found
+
+
+def _pieces(heights: Array, flat: NDArray[np.bool_], alike: float) -> tuple[NDArray[np.intp], int]:
+    """The number [rows, columns] of the piece that each flat cell hangs together with, side by side, and how many."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -190,29 +206,27 @@ def _roofs(
         ends.append(np.stack([number[one][joined], number[other][joined]]))
     first, second = np.concatenate(ends, axis=1)
     graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(heights.size, heights.size))
-    _, piece = connected_components(graph, directed=False)
-    size, of_planes = (np.bincount(piece, weights=part.ravel()) for part in (flat, flat & level))
-    roof = (size * cell**2 >= ROOF_M2) & (of_planes >= LEVEL * size)
-    return flat & roof[piece].reshape(heights.shape)
+    count, piece = connected_components(graph, directed=False)
+    return np.asarray(piece, np.intp).reshape(heights.shape), int(count)
 
 
-def _ground(
+def _foot(
     z: Array,
-    firm: NDArray[np.bool_],
+    ground: NDArray[np.bool_],
     row: NDArray[np.intp],
     column: NDArray[np.intp],
     way: tuple[int, int],
     step: float,
 ) -> Array:
-    """Height [N] of the measured ground before each edge, NaN where there is none, or something else before it."""
-    top, ground = z[row, column], np.full(len(row), np.nan)
+    """Height [N] of the ``ground`` before each edge, NaN where there is none, or something else before it."""
+    top, foot = z[row, column], np.full(len(row), np.nan)
     open_ = np.ones(len(row), bool)
     for k in range(1, GAP + 1):
         at = row + k * way[0], column + k * way[1]
         there = z[at]
         with np.errstate(invalid="ignore"):
-            low = open_ & (top - there > step) & firm[at]
+            low = open_ & (top - there > step) & ground[at]
             # The first cell may hold points of both, roof and ground.
             open_ &= ~low & ~(np.isfinite(there) & ((k > 1) | (top - there < 0.25 * step)))
-        ground[low] = there[low]
-    return ground
+        foot[low] = there[low]
+    return foot
