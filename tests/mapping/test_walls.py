@@ -68,6 +68,20 @@ def test_a_guess_beside_a_roof_is_no_ground() -> None:
     assert not len(wall_points(np.full_like(depth, np.nan), measured, CAMERA, DOWN)[0])
 
 
+def test_a_deck_under_which_the_ground_was_matched_has_no_walls() -> None:
+    depth = house()
+    depth[np.isnan(depth)] = 75
+    assert not len(wall_points(depth, np.isfinite(depth), CAMERA, DOWN)[0])
+
+
+def test_a_pit_of_wrong_matches_has_no_walls() -> None:
+    depth = np.full((300, 400), 75, np.float32)
+    depth[140:160, 240:260] = 85  # 5.7 m wide
+    depth[135:165, 235:240] = np.nan  # and what matching left open beside it
+    depth[135:165, 260:265] = np.nan
+    assert not len(wall_points(depth, np.isfinite(depth), CAMERA, DOWN)[0])
+
+
 def test_a_wall_is_cut_off_by_what_stands_before_it() -> None:
     depth = house()
     west, column = 195.0, np.arange(400)
@@ -111,3 +125,18 @@ def test_a_crown_that_is_flat_along_two_cells_is_no_roof(monkeypatch: pytest.Mon
     assert points(crown) == 0
     monkeypatch.setattr(walls, "LEVEL", 0.0)
     assert points(crown) > 1000
+
+
+def test_a_wall_gives_way_to_what_two_frames_agree_on() -> None:
+    low, high = np.zeros(2, np.int64), np.full(2, BLOCK)
+    n = 12
+    points = np.array([[10.5, 10.5, 2 * k + 0.5] for k in range(n)] * 2)
+    guesses = Cloud(
+        points, np.zeros((2 * n, 3), np.uint8), confidence=np.repeat([0.95, 0.85], n).astype(np.float32),
+        sigma_m=np.ones(2 * n, np.float32), views=np.repeat([1, 3], n).astype(np.uint8),
+        predicted=np.repeat([True, False], n),
+    )  # fmt: skip
+    made = thinned_tile(guesses[:0], guesses, np.repeat([WALL + 2, 4], n).astype(np.uint8), 1.0, low, high)
+    assert made.predicted is not None
+    assert not made.predicted.any()
+    assert len(made) == n

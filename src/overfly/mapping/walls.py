@@ -1,7 +1,7 @@
 """Walls that one image shows and no pair matches: between a roof's measured edge and the measured ground before it.
 
-A wall is seen from one side, at a flat angle, by few images: pairs find a quarter to a half of it. What stands above and below it
-is measured, though, and between the two nothing else can be.
+A wall is seen from one side, at a flat angle, by few images: pairs find a quarter to a half of it. What stands above
+and below it is measured, though, and between the two nothing else can be.
 """
 
 from __future__ import annotations
