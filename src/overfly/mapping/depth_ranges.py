@@ -26,7 +26,6 @@ how far beyond the others, as a share of the cameras' height, they are left out.
 BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
-
 UNDER = 0.3, 0.04
 """Room below the points' heights, as shares of their range and of the median depth: key points are rare in pits."""
 
@@ -39,15 +38,15 @@ class Span(NamedTuple):
     far: float
     low: float
 
-    def not_under(self, depth: NDArray[np.float32], camera: Camera, world_from_camera: Array) -> NDArray[np.float32]:
-        """The depths [H, W] of an undistorted frame whose place is not too low; NaN for the others.
+    def floor(self, camera: Camera, world_from_camera: Array) -> NDArray[np.float32]:
+        """Depth [H, W] in which each ray of an undistorted frame comes down to the lowest z; infinite if it does not.
 
         An oblique frame looks far at its top and near at its bottom: its range of depths alone reaches deep under the
         ground there, where wrong matches lie.
         """
-        rise = (rays(pixel_grid(camera.width, camera.height), camera) @ world_from_camera[2, :3]).astype(np.float32)
-        with np.errstate(invalid="ignore"):
-            return np.where(rise * depth > self.low - world_from_camera[2, 3], depth, np.float32(np.nan))
+        rise = rays(pixel_grid(camera.width, camera.height), camera) @ world_from_camera[2, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(rise < 0, (self.low - world_from_camera[2, 3]) / rise, np.inf).astype(np.float32)
 
 
 def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Array) -> list[Span]:

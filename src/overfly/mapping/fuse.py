@@ -73,7 +73,7 @@ def fuse(
     Raises:
         InputError: the maps hold no depth at all.
     """
-    fusion = _Fusion(depth_maps, frames, workdir, (single, walls), held)
+    fusion = _Fusion(depth_maps, frames, workdir, single=single, walls=walls, held=held)
     layout = Layout.read(workdir / "layout.json")
     if layout is None:
         parts = []
@@ -114,11 +114,14 @@ class _Fusion:
         depth_maps: Sequence[DepthMap],
         frames: Sequence[Frame],
         workdir: Path,
-        wanted: tuple[bool, bool],
+        *,
+        single: bool,
+        walls: bool,
         held: int,
     ) -> None:
         workdir.mkdir(parents=True, exist_ok=True)
-        self.maps, self.workdir, self.wanted = depth_maps, workdir, wanted
+        self.maps, self.workdir = depth_maps, workdir
+        self.single, self.walls = single, walls
         self.frames = {frame.name: frame for frame in frames}
         self.index = {m.name: k for k, m in enumerate(depth_maps)}
         self.load = lru_cache(maxsize=held)(lambda k: cleaned(depth_maps[k]))
@@ -139,7 +142,7 @@ class _Fusion:
         """Work out the points of a frame and keep them, and which pixels it gives, for the frames after it."""
         own = self.maps[k]
         cloud, apart, given, gsd = frame_points(
-            own, self.load(k), self._partners(k), self.frames[own.name], *self.wanted
+            own, self.load(k), self._partners(k), self.frames[own.name], self.single, self.walls
         )
         save_arrays(self._mask(k), {"bits": np.packbits(given), "shape": np.array(given.shape)})
         return write_part(self.path(k), cloud, apart, gsd)

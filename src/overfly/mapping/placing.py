@@ -133,13 +133,12 @@ def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame]) -> boo
 
 def tilted(bundle: Bundle, frames: Sequence[Frame]) -> NDArray[np.bool_]:
     """Which images of a bundle, in any frame of reference, are tilted otherwise than their gimbals say [k]."""
-    gimbals = [frames[i].gimbal for i in bundle.frames.tolist()]
-    known = np.array([gimbal is not None for gimbal in gimbals])
+    told = _ups(bundle, [frames[i].gimbal for i in bundle.frames.tolist()], level=False)
+    known = np.isfinite(told[:, 0])
     wrong = np.zeros(len(bundle), bool)
     if known.sum() < FEWEST_GIMBALS:
         return wrong
-    said = np.stack([rotation_from_gimbal(*gimbal)[2] for gimbal in gimbals if gimbal is not None])
-    ups = np.einsum("nij,nj->ni", bundle.world_from_camera[known], said)  # all alike, were there no errors
+    ups = np.einsum("nij,nj->ni", bundle.world_from_camera[known], told[known])  # all alike, were there no errors
     middle = np.median(ups, axis=0)
     angles = np.rad2deg(np.arccos(np.clip(ups @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
     if np.median(angles) < LEVEL_DEG:

@@ -238,6 +238,7 @@ def _depth(
 
     depths: list[Map] = []
     sigmas: list[Map] = []
+    floor = ranges[i].floor(flight.matched[i], flight.poses[i])
     for pair in pairs:
         match = np.load(_pair_file(workdir, pair))
         left, _, layout = _layout(flight, pair, ranges)
@@ -245,7 +246,8 @@ def _depth(
             continue
         seen = match if left == i else right_disparities(match)
         depth = depth_in_frame(seen, flight.matched[i], flight.poses[i], layout, right=left != i)
-        depths.append(ranges[i].not_under(depth, flight.matched[i], flight.poses[i]))
+        depth = np.where(depth < floor, depth, np.float32(np.nan))
+        depths.append(depth)
         sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
     small = flight.matched[i]
     shape = small.height, small.width

@@ -113,8 +113,7 @@ def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
     cell, step = seen.grid.cell, max(STEP_M, STEP_PIXELS * gsd)
     told = seen.filled if seen.predicted is None else seen.filled & ~(seen.predicted > 0.5)
     measured = np.where(told, seen.heights, np.nan)
-    firm = _firm(measured, ALIKE * cell)
-    roof, ground = _roofs(measured, firm, cell, max(FLAT_M, FLAT_PIXELS * gsd))
+    roof, ground = _roofs(measured, cell, max(FLAT_M, FLAT_PIXELS * gsd))
     margin = GAP + 1
     z = np.pad(seen.heights, margin, constant_values=np.nan)
     roof, ground = np.pad(roof, margin), np.pad(ground, margin)
@@ -152,10 +151,9 @@ def _firm(heights: Array, alike: float) -> NDArray[np.bool_]:
     return np.asarray(count >= FIRM)
 
 
-def _roofs(
-    heights: Array, firm: NDArray[np.bool_], cell: float, most: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _roofs(heights: Array, cell: float, most: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Firm cells [rows, columns] of pieces as large and as flat as a roof, and of those as large as ground."""
+    firm = _firm(heights, ALIKE * cell)
     flat = np.zeros(heights.shape, bool)
     flat[firm] = _flat(heights, np.argwhere(firm), cell, most, PLANE)
     piece, count = _pieces(heights, flat, ALIKE * cell)
