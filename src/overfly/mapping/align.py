@@ -25,6 +25,7 @@ from overfly.mapping.matches import Bar, matched
 from overfly.mapping.placing import UNKNOWN_M, placed
 from overfly.mapping.sparse import sparse_parts
 from overfly.mapping.survey import Precision
+from overfly.mapping.ties import hung_on_gps
 from overfly.networks.encoder import Encoder
 
 FEWEST_TO_JUDGE, UNJUDGED_M = 4, 1.5
@@ -153,6 +154,13 @@ def _held_block(
                 f"{len(apart)} images have too few points in common with the others and are held by GPS only "
                 f"({', '.join(apart[:5])}{' …' if len(apart) > 5 else ''}): between them and the rest the map may step "
                 "by the error of GPS."
+            )
+        hung = [flight.frames[i].name for i in result.bundle.frames[hung_on_gps(result.bundle)] if i not in at.apart]
+        if hung and len(result.bundle) > 2:
+            warnings.append(
+                f"{len(hung)} images share ground with others two at a time only ({', '.join(hung[:5])}"
+                f"{' …' if len(hung) > 5 else ''}): how far apart they stand is told by GPS alone, and heights there "
+                "are wrong by the same share. Fly with 60 % overlap or more along the lines."
             )
     else:
         bundle = parts[0]

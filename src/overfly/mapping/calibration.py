@@ -17,6 +17,7 @@ from overfly.mapping.database import focal_px
 from overfly.mapping.features import LONGEST_SIDE
 from overfly.mapping.model import FEWEST_TO_CALIBRATE
 from overfly.mapping.placing import widened
+from overfly.mapping.ties import unchecked_ties
 
 UNTOLD = "The images do not tell the focal length"
 KEPT = "The calibration is kept, but the map that it comes from did not tell its focal length well"
@@ -81,6 +82,7 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
     loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
     result = adjusted(bundle, loose, tolerance=ROUGHLY)
     kept = result.bundle.kept(result.bundle.errors() <= WORST_PX * _shrunk(bundle, frames))
+    kept = kept.kept(~unchecked_ties(kept, np.asarray(np.isfinite(held.places[:, :2]).all(1))))
     images = free(kept, NOISE_PX * _shrunk(kept, frames))
     again = replace(
         held,

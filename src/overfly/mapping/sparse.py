@@ -96,7 +96,7 @@ def sparse_parts(
         return best
     left = len(names) - (len(best[0]) if best else 0)
     failed = "contradicted GPS" if best and not agrees else f"left out {left} of {len(names)} images"
-    tried = "" if more is None else ", also with the network's"
+    tried = "" if more is None else ", also with the network's,"
     warnings.append(
         f"Matches were so few{tried} that sparse mapping {failed}: the cameras were started where GPS and gimbals say "
         "that they are, and are only roughly held by the images. Fly with more overlap."

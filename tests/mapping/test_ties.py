@@ -1,0 +1,92 @@
+"""Points in three images: what hands the length of one base on to the next, and what must not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from overfly.flights import Frame
+from overfly.geometry import Camera, fit_similarity, pose, project, rotation_from_gimbal, transform
+from overfly.mapping.bundle import Bundle
+from overfly.mapping.calibration import adjusted_twice, held_by_images
+from overfly.mapping.ties import hung_on_gps, unchecked_ties
+
+CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
+PLACES = np.array([(0.0, 50.0 * k, 100.0) for k in range(4)] + [(60.0, 150.0, 100.0)])
+"""A line with half of every image in the next one and nothing in the one after that; beside its last image another."""
+
+
+def line(tracks: list[tuple[int, ...]], seed: int = 0) -> Bundle:
+    """Cameras above rough ground that see the points whose images ``tracks`` tells."""
+    rng = np.random.default_rng(seed)
+    points, rays = [], []
+    for number, images in enumerate(tracks):
+        middle = PLACES[list(images), :2].mean(0)
+        points.append([*(middle + rng.uniform(-15, 15, 2)), rng.uniform(0, 8)])
+        rays += [(i, number) for i in images]
+    poses = [pose(rotation_from_gimbal(0, -90), place) for place in PLACES]
+    image, point = np.array(rays, np.intp).T
+    ground = np.array(points)
+    pixels = np.array([project(ground[p : p + 1], CAMERA, poses[i])[0][0] for i, p in rays])
+    return Bundle(
+        frames=np.arange(len(PLACES), dtype=np.intp),
+        rotations=np.stack([matrix[:3, :3].T for matrix in poses]),
+        centres=PLACES.copy(),
+        lens_of=np.zeros(len(PLACES), np.intp),
+        lenses=np.array([[600.0, 400.0, 300.0, 0.0, 0.0]]),
+        lens_ids=(1,),
+        points=ground,
+        image=image,
+        point=point,
+        pixels=pixels + rng.normal(0, 0.1, pixels.shape),
+    )
+
+
+PAIRS = [(0, 1)] * 150 + [(1, 2)] * 150 + [(2, 3)] * 150
+FIRM = [(2, 3, 4)] * 60
+ALL = np.ones(len(PLACES), bool)
+
+
+@pytest.mark.parametrize(("ties", "stands"), [(1, False), (3, False), (4, True), (6, True)])
+def test_few_ties_are_left_out_and_enough_are_kept(ties: int, stands: bool) -> None:
+    """Three are fewer than four, and than 2 % of the 153 common points."""
+    bundle = line(PAIRS + FIRM + [(0, 1, 2)] * ties)
+    out = unchecked_ties(bundle, ALL)
+    assert out.sum() == (0 if stands else ties)
+    left = bundle.kept(~out)
+    assert len(left.points) == len(bundle.points), "the two images with most in common keep the point"
+    assert hung_on_gps(left).tolist() == [not stands, not stands, False, False, False]
+
+
+def test_a_track_keeps_what_is_firm_in_it() -> None:
+    bundle = line(PAIRS + FIRM + [(1, 2, 3, 4)])
+    out = unchecked_ties(bundle, ALL)
+    assert bundle.image[out].tolist() == [1]
+
+
+def test_images_without_position_keep_every_tie() -> None:
+    """Nothing else holds these."""
+    bundle = line([*PAIRS, *FIRM, (0, 1, 2)])
+    assert not unchecked_ties(bundle, np.array([True, False, True, True, True])).any()
+    assert unchecked_ties(bundle, np.array([True, True, True, True, False])).sum() == 1
+
+
+def test_one_wrong_tie_does_not_outweigh_gps() -> None:
+    """A key point of the second image joined to a wrong place on its line in the fourth moved the image by metres."""
+    rng = np.random.default_rng(3)
+    bundle = line([*PAIRS, *FIRM, (1, 3, 4)])
+    wrong = np.flatnonzero((bundle.image == 1) & (bundle.point == len(bundle.points) - 1))
+    bundle.pixels[wrong, 1] += 60
+    frames = [
+        Frame(f"{k}.jpg", Path(f"{k}.jpg"), 800, 600, focal_px=600.0, gimbal=(0.0, -90.0, 0.0))
+        for k in range(len(PLACES))
+    ]
+    told = PLACES + rng.normal(0, 1.0, PLACES.shape)
+    ups = bundle.rotations[:, :, 2].copy()
+    held = replace(held_by_images(bundle, frames), places=told, place_sigmas=np.ones_like(told), ups=ups)
+    found = adjusted_twice(replace(bundle, centres=told), held, frames).bundle
+    off = transform(fit_similarity(found.centres, PLACES), found.centres) - PLACES
+    assert np.abs(off[1]).max() < 1.5
