@@ -30,7 +30,7 @@ FLYABLE = ("grid", "double_grid", "circular")
 
 OVERLAP, SIDE_OVERLAP = 80.0, 60.0
 """Percent. Along: rendered city blocks reach an F-score of 0.83 at 1 m with 80 % and 0.54 with 50 %. Between lines:
-Brighton Beach at 64 / 60 % reaches 0.99 at 1 m on open land (both in the README's tables)."""
+Brighton Beach at 64 / 60 % reaches 0.99 at 1 m on open land (docs/accuracy.md)."""
 
 FASTEST, SECONDS_PER_PHOTO, SECONDS_PER_TURN = 8.0, 2.0, 4.0
 """Metres a second that mapping apps fly at most; what a camera needs to store an image; what a turn costs."""
