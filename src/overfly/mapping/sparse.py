@@ -11,9 +11,10 @@ from overfly.flights import Flight
 from overfly.geometry import Array
 from overfly.mapping.bundle import Bundle, bundle_of, components
 from overfly.mapping.by_priors import bundle_by_priors
+from overfly.mapping.calibration import NOISE_PX
 from overfly.mapping.database import read_points, read_verified
 from overfly.mapping.matches import Bar
-from overfly.mapping.model import mapped
+from overfly.mapping.model import FEWEST_MATCHES, mapped
 from overfly.mapping.placing import agrees_with_gps
 
 ENOUGH = 0.95
@@ -58,7 +59,8 @@ def sparse_parts(
 
     def found(folder: Path, calibrate: bool) -> list[Bundle]:
         models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
-        return [bundle_of(model, numbers) for model in models]
+        parts = [bundle_of(model, numbers) for model in models]
+        return [part for part in parts if len(part.points) >= FEWEST_MATCHES]  # the others are left of wrong matches
 
     def built_up(folder: Path) -> list[Bundle]:
         held = [] if len(guessed) == len(names) else found(folder / "held", calibrate=False)
@@ -110,5 +112,6 @@ def _better(new: Bundle, old: Bundle, agrees: bool) -> bool:
 
 
 def _more_placed(new: Bundle, old: Bundle) -> bool:
-    """Whether a bundle has more images without much larger errors."""
-    return len(new) > len(old) and float(np.median(new.errors())) < WORSE * float(np.median(old.errors()))
+    """Whether a bundle has more images without much larger errors than the old one, or than key points have."""
+    usual = max(float(np.median(old.errors())), NOISE_PX)
+    return len(new) > len(old) and float(np.median(new.errors())) < WORSE * usual
