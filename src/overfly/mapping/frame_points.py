@@ -12,6 +12,7 @@ from overfly.flights import Frame
 from overfly.geometry import unproject
 from overfly.mapping.compared import Partner, compared
 from overfly.mapping.depth_map import DepthMap, Opinion
+from overfly.mapping.point_sigma import point_sigmas, roughness
 from overfly.mapping.subpixel import Map
 from overfly.mapping.thinning import WALL
 from overfly.mapping.walls import CONFIDENCE, SIGMA, wall_points
@@ -163,11 +164,17 @@ def frame_points(
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = unproject(pixels, merged, own.camera, own.world_from_camera)
+    rough = roughness(np.where(known, seen.depth, np.float32(np.nan)), own.camera.fx)
+    once = data.get("once", np.zeros(depth.shape, bool))
+    sigma = point_sigmas(
+        rough[fresh], agree[fresh], data["score"][fresh], confidence[fresh], seen.sigma[fresh], merged, own.camera.fx,
+        second=second[fresh], alone=alone[fresh], once=once[fresh],
+    )  # fmt: skip
     cloud = Cloud(
         points,
         image[rows, columns],
         confidence=confidence[fresh],
-        sigma_m=seen.sigma[fresh].astype(np.float32),
+        sigma_m=sigma,
         views=(1 + votes[fresh]).astype(np.uint8),
         predicted=alone[fresh],
     )
