@@ -18,7 +18,9 @@ class Fake:
     """A model of some images with common points, as far as the choice looks at it."""
 
     def __init__(self, images: list[int], links: dict[tuple[int, int], int], points: int = 300) -> None:
-        self.frames, self.common, self.points = np.array(images), links, points
+        self.frames, self.common, self.count = np.array(images), links, points
+        self.centres = np.array([[10.0 * i, 0, 50] for i in images])
+        self.points, self.point, self.image = np.zeros((1, 3)), np.zeros(1, int), np.zeros(1, int)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -30,10 +32,7 @@ class Fake:
         return len(self.frames)
 
     def num_points3D(self) -> int:
-        return self.points
-
-    def reg_image_ids(self) -> list[int]:
-        return self.frames.tolist()
+        return self.count
 
 
 RIGHT = Fake([0, 1, 2, 3], {(0, 1): 98, (1, 2): 99, (2, 3): 95})
@@ -78,3 +77,6 @@ def test_only_matches_between_images_of_the_model_count(monkeypatch: pytest.Monk
     assert model._upheld(half, NAMES, MATCHES) == 2
     assert model._upheld(Fake([0, 1], {(0, 1): 49}), NAMES, MATCHES) == 0
     assert model._upheld(Fake([0, 3], {}), NAMES, MATCHES) == 2, "they have none: nothing contradicts them"
+    copy = Fake([0, 1], {})
+    copy.centres[1] = copy.centres[0] + [0, 1, 0]
+    assert model._upheld(copy, NAMES, MATCHES) == 2, "from one place no point can be told"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from overfly.mapping.point_sigma import point_sigmas, roughness
+from overfly.mapping.point_sigma import ROUGHEST, point_sigmas, roughness
 
 FOCAL = 800.0
 
@@ -21,16 +21,29 @@ def test_a_plane_is_smooth_however_it_slants_and_noise_is_what_it_is() -> None:
     assert np.sqrt(np.mean(rough[inner] ** 2)) == pytest.approx(0.05 * np.sqrt(22 / 25), rel=0.02)
 
 
-def test_holes_are_no_roughness_and_steps_are() -> None:
-    depth = np.full((40, 40), 50, np.float32)
-    depth[10:14, 10:14] = np.nan
+def test_holes_and_borders_are_no_roughness_and_steps_are() -> None:
+    rng = np.random.default_rng(1)
+    rows, columns = np.mgrid[:60, :80].astype(np.float32)
+    depth = 50 + 0.3 * columns + 0.1 * rows
+    depth[rng.random(depth.shape) < 0.4] = np.nan
+    known = np.isfinite(depth)
     rough = roughness(depth, FOCAL)
-    assert np.nanmax(rough) < 1e-3
+    assert np.quantile(rough[known], 0.95) < 1e-2, "a slope with holes is as smooth as one without"
+    noisy = depth + rng.normal(0, 0.2, depth.shape).astype(np.float32)
+    found = (roughness(noisy, FOCAL) / FOCAL * depth)[3:-3, 3:-3]
+    assert np.sqrt(np.nanmean(found[known[3:-3, 3:-3]] ** 2)) == pytest.approx(0.2 * np.sqrt(12 / 15), rel=0.05)
+    depth = np.full((40, 40), 50, np.float32)
     depth[:, 20:] = 40
     rough = roughness(depth, FOCAL)
     assert rough[30, 19] > 10
     assert rough[30, 10] < 1e-3
-    assert np.isfinite(roughness(np.full((9, 9), np.nan, np.float32), FOCAL)).all()
+
+
+def test_where_hardly_anything_is_known_nothing_is_smooth() -> None:
+    lone = np.full((20, 20), np.nan, np.float32)
+    assert (roughness(lone, FOCAL) == ROUGHEST).all()
+    lone[10, 10] = 50
+    assert roughness(lone, FOCAL)[10, 10] == ROUGHEST
 
 
 def sigma(rough: float, *, agree: int = 1, score: float = 0.9, confidence: float = 0.8, **flags: bool) -> float:

@@ -44,7 +44,8 @@ def test_overlaps_sigma_and_lines_of_a_grid():
     assert np.median(seen.forward) == pytest.approx(0.8, abs=0.005)
     assert np.median(seen.side) == pytest.approx(0.6, abs=0.005)
     base = planned.plan.line_spacing_m / planned.plan.altitude
-    assert seen.sigma_z_m == pytest.approx(0.3 * 0.03 / base, rel=0.02)
+    # Maps match images at 1600 pixels, whatever the camera has.
+    assert seen.sigma_z_m == pytest.approx(0.3 * 0.03 * camera.width / 1600 / base, rel=0.02)
     # Lines along the longer side, from border to border: 200 m across at 40 % of the width.
     width = 0.03 * camera.width
     assert planned.lines == 1 + np.ceil(200 / (0.4 * width) - 0.1)
@@ -215,7 +216,7 @@ def test_large_plans_do_not_count_every_image():
     planned = plan_area("900x700", camera="p4p", gsd_cm=1.4)
     assert len(planned.plan) > LOOKED_AT
     assert planned.shares is None
-    planned.table()
+    assert f"not counted beyond {LOOKED_AT} photographs" in list(planned.table().columns[1].cells)
 
 
 def test_command(tmp_path, monkeypatch, capsys):
@@ -227,6 +228,7 @@ def test_command(tmp_path, monkeypatch, capsys):
     assert not done.value.code
     said = capsys.readouterr().out
     assert "expected sigma in height" in said
+    assert "in images of 1600 px" in " ".join(said.split())
     assert "131 m are above the 120 m" in said
     assert kml.is_file()
     monkeypatch.setattr("sys.argv", [*arguments, "--overlap", "200"])

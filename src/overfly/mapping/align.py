@@ -22,10 +22,10 @@ from overfly.mapping.database import focal_px, strongest_pair
 from overfly.mapping.depth_ranges import beside_others
 from overfly.mapping.georeference import by_ground
 from overfly.mapping.matches import Bar, matched
-from overfly.mapping.placing import UNKNOWN_M, placed
+from overfly.mapping.placing import UNKNOWN_M, placed, some_of
 from overfly.mapping.sparse import sparse_parts
 from overfly.mapping.survey import Precision
-from overfly.mapping.ties import hung_on_gps
+from overfly.mapping.ties import untied
 from overfly.networks.encoder import Encoder
 
 FEWEST_TO_JUDGE, UNJUDGED_M = 4, 1.5
@@ -149,18 +149,18 @@ def _held_block(
                                 places=at.places, place_sigmas=at.sigmas, lever=True), flight.frames)  # fmt: skip
         _remark_scale(at.places[:, :2], at.sigmas[:, :2], warnings)
         apart = [flight.frames[i].name for i in at.apart]
+        own = [flight.frames[i] for i in result.bundle.frames]
+        alone = np.isin(result.bundle.frames, at.apart)
         if apart:
             warnings.append(
-                f"{len(apart)} images have too few points in common with the others and are held by GPS only "
-                f"({', '.join(apart[:5])}{' …' if len(apart) > 5 else ''}): between them and the rest the map may step "
-                "by the error of GPS."
+                f"{some_of(alone, own)} have too few points in common with the others and are held by GPS only: "
+                "between them and the rest the map may step by the error of GPS."
             )
-        hung = [flight.frames[i].name for i in result.bundle.frames[hung_on_gps(result.bundle)] if i not in at.apart]
-        if hung and len(result.bundle) > 2:
+        if len(own) > 2 and (loose := untied(result.bundle) & ~alone).any():
             warnings.append(
-                f"{len(hung)} images share ground with others two at a time only ({', '.join(hung[:5])}"
-                f"{' …' if len(hung) > 5 else ''}): how far apart they stand is told by GPS alone, and heights there "
-                "are wrong by the same share. Fly with 60 % overlap or more along the lines."
+                f"{some_of(loose, own)} share ground with others two at a time only: how far apart they stand is told "
+                "by their positions (GPS, ground control) and not by the images, and heights there are wrong by as "
+                "much, in percent. Fly with 60 % overlap or more along the lines."
             )
     else:
         bundle = parts[0]

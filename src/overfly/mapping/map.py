@@ -20,9 +20,9 @@ from overfly.mapping.calibration import source_remarks
 from overfly.mapping.deliver import deliver
 from overfly.mapping.dense import how_dense, memory_budget, stereo_cloud, sweep_cloud
 from overfly.mapping.heights import check_heights, check_place, with_heights
-from overfly.mapping.needs import Sizes, least_gb
+from overfly.mapping.needs import SIZE, Sizes, least_gb
 from overfly.mapping.report import count_text
-from overfly.mapping.settings import SIZE, MapSettings
+from overfly.mapping.settings import MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles
 

@@ -26,6 +26,9 @@ KEPT = 0.5
 """Share of the verified matches of an image that a model must keep as common points, or it contradicts the image. In
 right models of real and rendered flights all images keep 0.56 and more, most 0.95; misplaced ones kept 0 to 0.45."""
 
+NO_BASE = 0.03
+"""Of the distance to the ground: pairs taken from nearer to each other, such as copies, have no points to keep."""
+
 CONTRADICTED = 0.02
 """Share of the images that may be contradicted before another way of mapping is tried."""
 
@@ -70,7 +73,7 @@ def mapped(
         if part is None or part.num_reg_images() < 2:
             break
         models.append(part)
-    return models
+    return sorted(models, key=lambda model: -model.num_reg_images())
 
 
 class _Judged(NamedTuple):
@@ -91,10 +94,13 @@ def _upheld(model: Any, names: Sequence[str], matches: Mapping[tuple[int, int], 
     bundle = bundle_of(model, {name: i for i, name in enumerate(names)})
     row = {frame: k for k, frame in enumerate(bundle.frames.tolist())}
     links = bundle.links()
+    away = float(np.median(np.linalg.norm(bundle.points[bundle.point] - bundle.centres[bundle.image], axis=1)))
     had, kept = np.zeros(len(bundle)), np.zeros(len(bundle))
     for (i, j), count in matches.items():
         if i in row and j in row:
             pair = [row[i], row[j]]
+            if np.linalg.norm(bundle.centres[pair[0]] - bundle.centres[pair[1]]) < NO_BASE * away:
+                continue
             had[pair] += count
             kept[pair] += min(count, links.get((min(pair), max(pair)), 0))
     return int((kept >= KEPT * had).sum())

@@ -11,6 +11,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+SIZE = 1600
+"""Default of the longest side at which images are matched, pixels."""
+
 CORE_SECONDS_PER_MEGAPIXEL = 100 / (18 * 1.6 * 0.9)
 """Of a map with estimated cameras: 100 core-seconds for 18 images of 1600 x 900, measured."""
 

@@ -89,9 +89,9 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
             continue
         if (wrong := tilted(part, frames)).any():
             warnings.append(
-                f"{_some(wrong, own)} are tilted by more than {TILTED_DEG:.0f} degrees against what their gimbals say: "
-                "wrong matches have placed them, or these gimbals are wrong. Look at the picture of the block, and fly "
-                "with more overlap."
+                f"{some_of(wrong, own)} are tilted by more than {TILTED_DEG:.0f} degrees against what their gimbals "
+                "say: wrong matches have placed them, or these gimbals are wrong. Look at the picture of the block, "
+                "and fly with more overlap."
             )
         clean = without_faults(part, places, own, warnings)
         if np.isnan(clean).sum() > np.isnan(places).sum() and np.isfinite(clean[:, :2]).all(1).sum() >= 2:
@@ -158,7 +158,7 @@ def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warni
     flat = np.linalg.norm(away[:, :2], axis=1)
     wrong = far_off(flat)
     if wrong.any():
-        warnings.append(f"The GPS position of {_some(wrong, frames)} is far off and was not used.")
+        warnings.append(f"The GPS position of {some_of(wrong, frames)} is far off and was not used.")
     places[wrong] = np.nan
     rise = np.where(wrong, np.nan, away[:, 2])
     if np.isfinite(rise).sum() >= 4:
@@ -181,14 +181,15 @@ def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warni
     if high.any():
         typical = float(np.median(rise[high]))
         warnings.append(
-            f"The altitude of {_some(high, frames)} disagrees with the others by about {abs(typical):.0f} m and was "
+            f"The altitude of {some_of(high, frames)} disagrees with the others by about {abs(typical):.0f} m and was "
             "not used: look for frames that tell it above another level."
         )
     places[high, 2] = np.nan
     return places
 
 
-def _some(chosen: NDArray[np.bool_], frames: Sequence[Frame]) -> str:
+def some_of(chosen: NDArray[np.bool_], frames: Sequence[Frame]) -> str:
+    """How many frames [n] are chosen, and the first of their names."""
     names = [frames[k].name for k in np.flatnonzero(chosen).tolist()]
     return f"{len(names)} images ({', '.join(names[:5])}{' …' if len(names) > 5 else ''})"
 

@@ -16,6 +16,9 @@ from overfly.mapping.subpixel import Map
 SIDE = 5
 """Pixels along the window in which roughness is measured."""
 
+FEWEST = 8
+"""Known depths that a window must hold."""
+
 SMOOTHEST, ROUGHEST = 0.05, 3.0
 """Ground pixels: roughness below the first is that of the grid of disparities, beyond the second it says no more."""
 
@@ -37,25 +40,33 @@ def roughness(depth: Map, focal: float) -> NDArray[np.float32]:
     """How far depths scatter about a plane, ground pixels [H, W]: the standard deviation in a window of :data:`SIDE`.
 
     Args:
-        depth: [H, W] metres, NaN where unknown. Unknown neighbours count as lying at the others' mean.
+        depth: [H, W] metres, NaN where unknown; it is left out. Where fewer than :data:`FEWEST` are known the surface
+            counts as rough.
         focal: pixels.
     """
     import cv2
 
     known = np.isfinite(depth)
     if not known.any():
-        return np.zeros(depth.shape, np.float32)
-    window, middle = (SIDE, SIDE), float(np.median(depth[known]))
-    z = np.where(known, depth - middle, 0).astype(np.float64)
-    share = cv2.boxFilter(known.astype(np.float64), -1, window)
-    z = np.where(known, z, cv2.boxFilter(z, -1, window) / np.maximum(share, 1e-9))
-    mean = cv2.boxFilter(z, -1, window)
-    variance = cv2.boxFilter(z * z, -1, window) - mean * mean
-    ramp = np.tile(np.arange(SIDE) - SIDE // 2, (SIDE, 1)).astype(np.float64)
-    for slope in (ramp, ramp.T):  # what a plane explains
-        variance -= cv2.filter2D(z, -1, slope / SIDE**2) ** 2 / np.mean(ramp**2)
+        return np.full(depth.shape, ROUGHEST, np.float32)
+    ramp = np.arange(SIDE, dtype=np.float64) - SIDE // 2
+    weight = known.astype(np.float32)  # sums of small whole numbers are exact
+    z = np.where(known, depth - np.median(depth[known]), 0).astype(np.float64)
+
+    def total(values: NDArray, across: int = 0, down: int = 0) -> NDArray:
+        """Of the window, weighted by powers of the distance from its middle."""
+        return np.asarray(cv2.sepFilter2D(values, -1, ramp**across, ramp**down, borderType=cv2.BORDER_CONSTANT))
+
+    n = np.maximum(total(weight), 1)
+    x, y, mean = total(weight, 1) / n, total(weight, 0, 1) / n, total(z) / n
+    xx, yy, xy = total(weight, 2) / n - x * x, total(weight, 0, 2) / n - y * y, total(weight, 1, 1) / n - x * y
+    xz, yz = total(z, 1) / n - x * mean, total(z, 0, 1) / n - y * mean
+    flat = np.maximum(xx * yy - xy * xy, 1e-9)
+    explained = (xz * xz * yy - 2 * xz * yz * xy + yz * yz * xx) / flat
+    variance = total(z * z) / n - mean * mean - explained
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.sqrt(np.maximum(variance, 0)) / depth * focal, np.float32)
+        rough = np.sqrt(np.maximum(variance, 0)) / depth * focal
+    return np.where(known & (n >= FEWEST), rough, ROUGHEST).astype(np.float32)
 
 
 def point_sigmas(

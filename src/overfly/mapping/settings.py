@@ -10,15 +10,12 @@ from typing import Any
 from overfly.errors import InputError, unknown
 from overfly.geodesy import vertical_crs
 from overfly.mapping.matches import MATCHERS
-from overfly.mapping.needs import mesh_gb
+from overfly.mapping.needs import SIZE, mesh_gb
 from overfly.mapping.survey import CONTROL
 from overfly.mapping.sweep import TrainedRun
 
 CAMERAS = ("auto", "given", "estimate")
 DENSE = ("sweep", "stereo")
-
-SIZE = 1600
-"""Default of the longest side at which images are matched, pixels."""
 
 MESH_FACES = 200_000
 """Default of the triangles of the textured mesh."""

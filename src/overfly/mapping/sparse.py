@@ -11,7 +11,6 @@ from overfly.flights import Flight
 from overfly.geometry import Array
 from overfly.mapping.bundle import Bundle, bundle_of, components
 from overfly.mapping.by_priors import bundle_by_priors
-from overfly.mapping.calibration import NOISE_PX
 from overfly.mapping.database import read_points, read_verified
 from overfly.mapping.matches import Bar
 from overfly.mapping.model import FEWEST_MATCHES, mapped
@@ -22,6 +21,9 @@ ENOUGH = 0.95
 
 WORSE = 2.0
 """Times by which reprojection errors may be larger where more images are placed."""
+
+GOOD_PX = 0.5
+"""Errors below which all bundles are alike."""
 
 
 def sparse_parts(
@@ -112,6 +114,6 @@ def _better(new: Bundle, old: Bundle, agrees: bool) -> bool:
 
 
 def _more_placed(new: Bundle, old: Bundle) -> bool:
-    """Whether a bundle has more images without much larger errors than the old one, or than key points have."""
-    usual = max(float(np.median(old.errors())), NOISE_PX)
+    """Whether a bundle has more images without much larger errors than the old one, if these say anything."""
+    usual = max(float(np.median(old.errors())), GOOD_PX)
     return len(new) > len(old) and float(np.median(new.errors())) < WORSE * usual

@@ -1,28 +1,22 @@
-"""Ties: points in three images, which hand the length of one base on to the next.
+"""Ties: points in three images and more, which hand the length of one base on to the next.
 
 Two images that share points tell their base only against the ground below. Along a line with 50 % overlap hardly any
 point is in three images, and the one or two that seem to be are as likely wrong as right: nothing checks them, and yet
-they outweigh GPS. Four can check each other.
+they outweigh GPS. Where an image has many, they check each other.
 """
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.geometry import Array
-from overfly.mapping.bundle import Bundle, Index
+from overfly.mapping.bundle import Bundle
 
-FEWEST = 4
-"""Points that three images must have in common."""
+FEWEST, SHARE = 4, 0.01
+"""Ties that an image must have, and their share of its rays: of verified matches about a hundredth is wrong."""
 
-SHARE = 0.02
-"""Or this share of what two of them have: of verified matches about a hundredth is wrong."""
-
-LONGEST = 8
-"""Tracks through more images are not questioned: these overlap many times."""
+LEFT = 8
+"""Rays that an image must have besides, or it keeps its ties: they may be what places it."""
 
 
 def unchecked_ties(bundle: Bundle, placed: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -33,68 +27,33 @@ def unchecked_ties(bundle: Bundle, placed: NDArray[np.bool_]) -> NDArray[np.bool
         placed: images [n] whose GPS position is known. Tracks through others stay whole: nothing else holds these.
 
     Returns:
-        Of tracks through three images and more the rays of images that are in no firm triple of it. Of a track without
-        any the two images with most points in common keep theirs.
+        Of tracks through three images and more, the rays of images that have too few such tracks. Where fewer than two
+        others would be left of a track, the two images with most points in common keep theirs.
     """
-    out = np.zeros(len(bundle.image), bool)
-    tracks = _tracks(bundle, placed)
-    if not tracks:
-        return out
-    n = len(bundle)
-    codes = [_code(bundle.image[rays], three, n) for rays in tracks for three in _choices(rays, 3)]
-    triples, counts = np.unique(np.concatenate(codes), return_counts=True)
+    n, m = len(bundle), len(bundle.points)
+    length = np.bincount(bundle.point, minlength=m)
+    tie = length[bundle.point] >= 3
+    rays = np.bincount(bundle.image, minlength=n)
+    ties = np.bincount(bundle.image[tie], minlength=n)
+    weak = placed & (ties < np.maximum(FEWEST, SHARE * rays)) & (rays - ties >= LEFT)
+    known = np.bincount(bundle.point[~placed[bundle.image]], minlength=m) == 0
+    out = tie & weak[bundle.image] & known[bundle.point]
+    left = length - np.bincount(bundle.point[out], minlength=m)
     links = bundle.links()
-    pairs = np.array([i * n + j for i, j in links] or [-1])
-    common = np.array(list(links.values()) or [0])
-    firm = (counts >= FEWEST) | (counts >= SHARE * _most(triples, n, pairs, common))
-    for rays in tracks:
-        images = bundle.image[rays]
-        good = np.zeros(rays.shape, bool)
-        for three in _choices(rays, 3):
-            good[:, three] |= firm[np.searchsorted(triples, _code(images, three, n))][:, None]
-        twos = _choices(rays, 2)
-        most = np.argmax([common[np.searchsorted(pairs, _code(images, two, n))] for two in twos], axis=0)
-        loose = ~good.any(1)
-        good[np.flatnonzero(loose)[:, None], np.array(twos)[most[loose]]] = True
-        out[rays[~good]] = True
+    start = np.cumsum(length) - length  # rays are ordered by point
+    for point in np.flatnonzero((left < 2) & (length >= 3)).tolist():
+        own = range(start[point], start[point] + length[point])
+        image = bundle.image[own].tolist()
+        common: dict[tuple[int, int], int] = {
+            (a, b): links[min(i, j), max(i, j)] for a, i in zip(own, image) for b, j in zip(own, image) if a < b
+        }
+        out[own] = True
+        out[list(max(common.items(), key=lambda item: item[1])[0])] = False
     return out
 
 
-def hung_on_gps(bundle: Bundle) -> NDArray[np.bool_]:
-    """Images [n] that share points with others, but none in three images: GPS alone tells their bases."""
+def untied(bundle: Bundle) -> NDArray[np.bool_]:
+    """Images [n] that share points with others two at a time only: nothing but their positions tells their bases."""
     views = np.bincount(bundle.point, minlength=len(bundle.points))[bundle.point]
     tied = np.bincount(bundle.image[views >= 3], minlength=len(bundle)) > 0
     return np.asarray(~tied & (np.bincount(bundle.image, minlength=len(bundle)) > 0))
-
-
-def _tracks(bundle: Bundle, placed: NDArray[np.bool_]) -> list[Index]:
-    """Rays [t, s] of the tracks in question, images ascending, a table for each length s."""
-    order = np.lexsort((bundle.image, bundle.point))
-    length = np.bincount(bundle.point, minlength=len(bundle.points))
-    known = np.bincount(bundle.point[~placed[bundle.image]], minlength=len(bundle.points)) == 0
-    start = np.cumsum(length) - length
-    found = []
-    for size in range(3, LONGEST + 1):
-        first = start[known & (length == size)]
-        if len(first):
-            found.append(order[first[:, None] + np.arange(size)])
-    return found
-
-
-def _choices(rays: Index, count: int) -> list[list[int]]:
-    return [list(chosen) for chosen in combinations(range(rays.shape[1]), count)]
-
-
-def _code(images: Index, chosen: list[int], n: int) -> Index:
-    """One number for the chosen columns of images [t, s]."""
-    code = np.zeros(len(images), np.intp)
-    for column in chosen:
-        code = code * n + images[:, column]
-    return code
-
-
-def _most(triples: Index, n: int, pairs: Index, common: Index) -> Array:
-    """The largest number of points that two images of each triple have in common."""
-    i, j, k = triples // (n * n), triples // n % n, triples % n
-    counts = [common[np.searchsorted(pairs, a * n + b)] for a, b in ((i, j), (j, k), (i, k))]
-    return np.asarray(np.max(counts, axis=0), float)

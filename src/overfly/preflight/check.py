@@ -15,8 +15,7 @@ from overfly.flights import Flight, read_flight
 from overfly.geometry import Array
 from overfly.mapping.needs import core_seconds, memory_gb
 from overfly.mapping.report import duration, length_text
-from overfly.preflight.accuracy import SIGMA_PX
-from overfly.preflight.coverage import Coverage, cover
+from overfly.preflight.coverage import SIGMA_OF, Coverage, cover
 from overfly.preflight.findings import Finding, count, ranked
 from overfly.preflight.gaps import Gap, gaps_of
 from overfly.preflight.ground import Placement, place
@@ -112,7 +111,7 @@ class Check:
             table.add_row(label, value)
         assumed = "Without positions overlap cannot be told." if self.placed is None else self.placed.assumed
         if self.seen is not None:
-            assumed += f" Sigma of well matched points at {SIGMA_PX} px: plants and the error of GPS are not in it."
+            assumed += f" Sigma of {SIGMA_OF}: plants and the error of GPS are not in it."
         table.caption = (
             f"{assumed} Time at the measured rate of maps with estimated cameras, memory by the map's own estimate."
         )

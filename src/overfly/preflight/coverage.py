@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 
 from overfly.data.footprints import footprint, ground_overlaps
 from overfly.geometry import Array
+from overfly.mapping.needs import SIZE
 from overfly.mapping.raster import Grid
-from overfly.preflight.accuracy import sigma_xy_m, sigma_z_m
+from overfly.preflight.accuracy import SIGMA_PX, sigma_xy_m, sigma_z_m
 from overfly.preflight.ground import Placement, lines_of
+
+SIGMA_OF = f"points matched to {SIGMA_PX} px in images of {SIZE} px (overfly map --size)"
+"""What the expected sigma supposes."""
 
 CELLS = 500
 """Cells along the longer side of the raster."""
@@ -40,6 +44,7 @@ class Coverage:
         side: overlap of each image with the best one of the next line.
         base_to_height: of each image and its stereo partner [n]; NaN without partner.
         gsd_m: metres per pixel on the ground [n].
+        matched_gsd_m: the same at the size at which ``overfly map`` matches images unless told otherwise [n].
         blocks: number of the group of overlapping images to which each belongs [n], the largest is 0.
     """
 
@@ -54,6 +59,7 @@ class Coverage:
     side: Array
     base_to_height: Array
     gsd_m: Array
+    matched_gsd_m: Array
     blocks: NDArray[np.int64]
 
     @property
@@ -81,12 +87,12 @@ class Coverage:
     def sigma_z_m(self) -> float:
         """Median over the images, see :func:`overfly.preflight.accuracy.sigma_z_m`; inf where none has a partner."""
         known = np.isfinite(self.base_to_height)
-        values = [sigma_z_m(g, b) for g, b in zip(self.gsd_m[known], self.base_to_height[known])]
+        values = [sigma_z_m(g, b) for g, b in zip(self.matched_gsd_m[known], self.base_to_height[known])]
         return float(np.median(values)) if values else np.inf
 
     @property
     def sigma_xy_m(self) -> float:
-        return sigma_xy_m(float(np.median(self.gsd_m)))
+        return sigma_xy_m(float(np.median(self.matched_gsd_m)))
 
 
 def cover(placed: Placement) -> Coverage | None:
@@ -105,6 +111,8 @@ def cover(placed: Placement) -> Coverage | None:
     ahead = np.abs(placed.poses[:, 2, 2])
     focal = np.array([c.fx for c in placed.cameras])
     heights = np.maximum(placed.heights, 1e-9)
+    gsd = heights / np.maximum(ahead, 0.2) / focal
+    longest = np.array([max(c.width, c.height) for c in placed.cameras])
     return Coverage(
         grid=grid,
         views=views,
@@ -116,7 +124,8 @@ def cover(placed: Placement) -> Coverage | None:
         forward=forward,
         side=_side(xy, lines, overlaps, direction),
         base_to_height=_bases(placed.poses[:, :3, 3], overlaps) / heights,
-        gsd_m=heights / np.maximum(ahead, 0.2) / focal,
+        gsd_m=gsd,
+        matched_gsd_m=gsd * np.maximum(longest / SIZE, 1),
         blocks=_blocks(overlaps),
     )
 

@@ -17,9 +17,8 @@ from overfly.geodesy import geodetic_from_enu
 from overfly.geometry import Array
 from overfly.mapping.needs import core_seconds, memory_gb
 from overfly.mapping.report import area_text, duration, length_text
-from overfly.preflight.accuracy import SIGMA_PX
 from overfly.preflight.area import AskedArea, read_area
-from overfly.preflight.coverage import Coverage, cover
+from overfly.preflight.coverage import SIGMA_OF, Coverage, cover
 from overfly.preflight.ground import Placement
 from overfly.preflight.waypoints import waypoints, write_kml, write_litchi
 
@@ -94,6 +93,8 @@ class FlightPlan:
         from rich.table import Table
 
         plan, camera = self.plan, self.plan.camera
+        told = self.shares
+        shares = f"not counted beyond {LOOKED_AT} photographs" if told is None else " / ".join(f"{s:.0%}" for s in told)
         table = Table(title=f"{plan.flight_path} over {area_text(self.area.polygon.area)}", title_justify="left")
         table.add_column("what")
         table.add_column("value", justify="right")
@@ -115,7 +116,7 @@ class FlightPlan:
             ("length of the flight", f"{self.length_m / 1000:.2f} km"),
             (f"time at {self.speed:.1f} m/s, turns included", duration(self.seconds)),
             ("storage", f"{len(plan) * camera.width * camera.height * BYTES_PER_PIXEL / 1e9:.1f} GB"),
-            ("area seen by 0-1 / 2 / 3+ images", " / ".join(f"{s:.0%}" for s in self.shares or ()) or "many"),
+            ("area seen by 0-1 / 2 / 3+ images", shares),
             ("expected sigma in height", length_text(self.seen.sigma_z_m)),
             ("expected sigma in plan", length_text(self.seen.sigma_xy_m)),
             ("overfly map, one core / memory", f"{duration(core_seconds(sizes))} / {memory_gb(sizes):.1f} GB"),
@@ -123,8 +124,8 @@ class FlightPlan:
         for label, value in rows:
             table.add_row(label, value)
         table.caption = (
-            f"Over level ground. Sigma of points matched to {SIGMA_PX} px, without plants and the error of GPS (metres "
-            "without RTK or control points)."
+            f"Over level ground. Sigma of {SIGMA_OF}, without plants and the error of GPS (metres without RTK or "
+            "control points)."
         )
         table.caption_justify = "left"
         return table

@@ -22,8 +22,8 @@ from overfly.flights import Flight
 from overfly.mapping.block import Block
 from overfly.mapping.facts import ground_sampling
 from overfly.mapping.map import align_flight, measure_flight
+from overfly.mapping.needs import SIZE
 from overfly.mapping.rough_mesh import rough_mesh
-from overfly.mapping.settings import SIZE
 from overfly.mapping.steps import key_of
 from overfly.mesh import Mesh, read_mesh
 from overfly.refinement.colors import check_overlap, colors_from
