@@ -128,7 +128,7 @@ def verdict(summary: Mapping[str, Any]) -> str:
         text += " neither GPS nor an origin tells the size, only the shape is known."
     share = summary["predicted"] / max(summary["points"], 1)
     if share >= 0.005:
-        text += f" {share:.0%} of the points are predicted from less than two images, not measured."
+        text += f" {share:.0%} of the points are predicted, not measured: no two images agree on them."
     return text
 
 
@@ -177,7 +177,7 @@ def _accuracy(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
         (
             "Points measured / predicted",
             f"{count_text(summary['measured'])} / {count_text(summary['predicted'])}",
-            "predicted points are seen by less than two images: do not measure on them",
+            "on predicted points no two images agree: do not measure on them",
         )
     )
     if (surface := summary.get("surface")) is not None:
