@@ -37,7 +37,7 @@ class Cloud:
         points: [N, 3] float64, metres (local ENU, or easting, northing, height where ``epsg`` is set).
         colors: [N, 3] uint8 RGB, or None.
         confidence: [N] float32 in 0..1, or None.
-        sigma_m: [N] float32, standard deviation of the position in metres, or None.
+        sigma_m: [N] float32, standard deviation of the height (of points on walls: across them), metres, or None.
         views: [N] uint8, number of frames that measured the point, or None.
         predicted: [N] bool, True where fewer than two frames support the point, or None.
         epsg: projected CRS of the points, None for a local frame.

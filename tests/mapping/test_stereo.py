@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from overfly.errors import InputError
-from overfly.geometry import Camera, invert, unproject
+from overfly.geometry import Camera, invert, pose, rotation_from_gimbal, unproject
 from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.fuse import fuse
 from overfly.mapping.neighbours import choose_partners
-from overfly.mapping.stereo import stereo
+from overfly.mapping.stereo import BASE_TO_HEIGHT, stereo
 from overfly.mapping.subpixel import Shot, frame_to_frame, refine
 
 GSD = 80 / 320
@@ -42,8 +42,8 @@ def test_the_cloud_covers_what_two_frames_see(cloud, hill, strips, camera) -> No
     x, y = np.meshgrid(np.arange(-50, 50, 2.0), np.arange(-50, 50, 2.0))
     ground = np.stack([x, y, hill.height(np.stack([x, y], -1))], -1).reshape(-1, 3)
     times = np.zeros(len(ground), int)
-    for pose in [*strips[:3], *strips[5:]]:
-        local = (ground - pose[:3, 3]) @ pose[:3, :3]
+    for matrix in [*strips[:3], *strips[5:]]:
+        local = (ground - matrix[:3, 3]) @ matrix[:3, :3]
         times += (np.abs(local[:, :2] / local[:, 2:] * camera.fx) < [155, 115]).all(1)
     from scipy.spatial import cKDTree
 
@@ -172,6 +172,22 @@ def test_partners_overlap_and_are_far_enough_apart(strips, camera) -> None:  # t
     assert any(j >= 4 for j in partners[1])  # across the strips
     assert all(len(p) <= 4 for p in partners)
     assert 3 not in partners[0]  # three steps on, nothing in common
+
+
+def test_views_that_differ_much_are_partners_where_there_are_no_better_ones(camera) -> None:  # type: ignore[no-untyped-def]
+    """On a circle with an image every 60 degrees neighbours see their common ground from 65 degrees apart."""
+    angles = np.radians(60.0 * np.arange(6))
+    ring = [
+        pose(rotation_from_gimbal(float(np.degrees(a)) + 180, -55.0), [125 * np.sin(a), 125 * np.cos(a), 90])
+        for a in angles
+    ]
+    lens = replace(camera, fx=0.9 * camera.width, fy=0.9 * camera.width)
+    wide = choose_partners([lens] * 6, ring, [110.0] * 6, count=4, ratio=BASE_TO_HEIGHT)
+    assert all(wide)
+    assert not any(choose_partners([lens] * 6, ring, [110.0] * 6, count=4, ratio=(0.04, 0.9)))
+    between = pose(rotation_from_gimbal(210.0, -55.0), [125 * np.sin(angles[1] / 2), 125 * np.cos(angles[1] / 2), 90])
+    better = choose_partners([lens] * 7, [*ring, between], [110.0] * 7, count=4, ratio=BASE_TO_HEIGHT)
+    assert better[0][0] == better[1][0] == 6
 
 
 def test_depth_ranges_hold_the_points_and_fall_back_to_the_usual(strips, camera, hill) -> None:  # type: ignore[no-untyped-def]

@@ -66,9 +66,9 @@ def fuse(
 
     Returns:
         Tiles in ``workdir/tiles``: points with colour; ``views``, the frames that measured them (2 or more; 1 if
-        predicted); ``sigma_m``, their standard deviation along the ray; ``confidence``, the share of such points that
-        was found right; ``predicted``, the word of a network alone, kept where nothing was matched near, or a
-        wall, whose ``sigma_m`` is across it.
+        predicted); ``sigma_m``, the standard deviation of their height, of walls that across them; ``confidence``, the
+        share of such points that was found right; ``predicted``, the word of a network alone, kept where nothing was
+        matched near, or a wall.
 
     Raises:
         InputError: the maps hold no depth at all.

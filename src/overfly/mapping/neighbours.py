@@ -14,6 +14,9 @@ GRID = 8
 CANDIDATES = 40
 """Nearest cameras that are looked at."""
 
+WIDE = 0.9
+"""Base-to-height ratio beyond which a pair is only better than none, as on circles with an image every 60 degrees."""
+
 REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
 """What seeing a place once more is worth: the first partner makes it measured, the later ones make it sure."""
 
@@ -90,6 +93,4 @@ def _partners(
 def _value(base_to_height: Array, ratio: tuple[float, float]) -> Array:
     """1 between 0.15 and 0.45; less where depth is imprecise (narrow) or views differ too much (wide)."""
     low, high = ratio
-    rise = np.clip((base_to_height - low) / max(0.15 - low, 1e-9), 0, 1)
-    fall = np.clip(1 - 0.7 * (base_to_height - 0.45) / max(high - 0.45, 1e-9), 0, 1)
-    return np.where(base_to_height > high, 0.0, np.minimum(rise, fall))
+    return np.asarray(np.interp(base_to_height, [low, 0.15, 0.45, WIDE, high], [0, 1, 1, 0.3, 0]))

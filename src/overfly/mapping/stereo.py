@@ -35,7 +35,7 @@ Opinions = Callable[[int, list[int], Array], Opinion | None]
 """What a network says of a frame, given its partners and surface points [M, 3] that its pairs have measured."""
 
 Progress = Callable[[int, int], None]
-BASE_TO_HEIGHT = (0.04, 0.9)
+BASE_TO_HEIGHT = (0.04, 1.4)
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels of the matched size."""
 
