@@ -106,15 +106,10 @@ def carried_on(facts: Facts) -> tuple[NDArray, NDArray, list[NDArray]]:
     return facts["alone"] & facts["once"], np.log(facts["depth"]), [doubt]
 
 
-def word(facts: Facts) -> tuple[NDArray, NDArray, list[NDArray]]:
-    return facts["alone"] & ~facts["once"], np.log(facts["word"]), []
-
-
 CLASSES = {
     "matched": (matched, "MATCHED, ROUGHNESS_POWER, CONFIRMED_BY_NONE, CORRELATED"),
     "moved": (moved, "MOVED, MOVED_SURE"),
     "carried on": (carried_on, "log CARRIED_ON, DOUBT_POWER"),
-    "word": (word, "log WORD"),
 }
 FEWEST, FITTED = 150, 6000
 """Points of a class that a flight must have to count, and so many of each are fitted to."""

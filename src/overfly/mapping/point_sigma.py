@@ -3,7 +3,7 @@
 What a pair has matched is as exact as the surface around it is smooth: where depths scatter about a plane through
 their neighbours there are leaves, edges and wrong matches, and what correlation promises (a quarter of a pixel of
 disparity) means little. The constants are those of the 68.3 % quantile of errors on twelve rendered flights of all
-styles and paths, 80 to 300 m high, with exact cameras; heights were compared with the surface at the nearest place.
+styles and paths, 80 to 300 m high, with exact cameras (``benchmarks/sigma.py``).
 """
 
 from __future__ import annotations
@@ -22,18 +22,15 @@ FEWEST = 8
 SMOOTHEST, ROUGHEST = 0.05, 3.0
 """Ground pixels: roughness below the first is that of the grid of disparities, beyond the second it says no more."""
 
-ROUGHNESS_POWER = 0.755
-MATCHED, CONFIRMED_BY_NONE, CORRELATED = 0.69, 0.42, -0.74
+ROUGHNESS_POWER = 0.87
+MATCHED, CONFIRMED_BY_NONE, CORRELATED = 0.69, 0.32, -0.62
 """Logarithm of ground pixels; of what no other frame confirms; and of correlation 1."""
 
-MOVED, MOVED_SURE = 2.59, -2.34
+MOVED, MOVED_SURE = 2.31, -1.68
 """The same of a network's word that was moved to where images correlate, and of confidence 1."""
 
-CARRIED_ON, DOUBT_POWER, SUREST = 0.03, 2.37, 0.85
+CARRIED_ON, DOUBT_POWER, SUREST = 0.006, 0.46, 0.85
 """Of the distance, for ground that is carried on into what one frame sees, by a power of the doubt left."""
-
-WORD = 0.61
-"""Of the network's own standard deviation, for its word where several frames see the place."""
 
 
 def roughness(depth: Map, focal: float) -> NDArray[np.float32]:
@@ -92,5 +89,5 @@ def point_sigmas(
     moved = np.exp(MOVED + surface + MOVED_SURE * confidence)
     carried_on = CARRIED_ON * depth * (1 - np.minimum(confidence, SUREST)) ** DOUBT_POWER
     sigma = np.where(second, moved, matched) * depth / focal
-    sigma = np.where(alone, np.where(once, carried_on, WORD * word), sigma)
+    sigma = np.where(alone, np.where(once, carried_on, word), sigma)
     return np.asarray(sigma, np.float32)
