@@ -7,7 +7,8 @@ does. Of every point of the cloud it is kept what its standard deviation is made
 the surface at the nearest place rises less than 60 degrees; else, of predicted points, the distance to it. Constants
 are fitted to the 68.3 % quantile of the logarithm of errors (pinball loss); the table tells what share of each
 flight's points lies within one and two standard deviations by the constants in the source, and by constants that were
-fitted to the eleven other flights. What is in --work is kept: a second call only fits.
+fitted to the eleven other flights. What is in --work is kept: a second call only fits (those of moved points
+follow the power in the source: put the new one in and call again).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from truth.case import CELLS, STEEP, Case
 
 from overfly.mapping import point_sigma as source
 from overfly.mapping.depth_map import ONE_SIGMA
-from overfly.mapping.map import measure_flight
+from overfly.mapping.map import DENSE_FORM, measure_flight
 from overfly.mapping.walls import CONFIDENCE
 from overfly.shipped import load_network
 from overfly.tables import markdown
@@ -44,7 +45,7 @@ Facts = dict[str, NDArray]
 
 def facts_of(case: Case, network: Any) -> Facts:
     """Of points of a flight's cloud: everything that ``point_sigmas`` is given, and their errors."""
-    kept = case.folder / "sigma.npz"
+    kept = case.folder / f"sigma-{DENSE_FORM}.npz"
     if kept.is_file():
         return dict(np.load(kept))
     given: list[Facts] = []
@@ -156,6 +157,8 @@ def main() -> None:
     for label, (which, names) in CLASSES.items():
         parts = {name: terms(facts, which) for name, facts in flights.items()}
         parts = {name: part for name, part in parts.items() if len(part[1]) >= FEWEST}
+        if len(parts) < 2:
+            continue
         print(f"{names} = {', '.join(f'{c:.3f}' for c in fitted(list(parts.values())))}")
         for name, (design, target) in parts.items():
             others = fitted([part for other, part in parts.items() if other != name])
@@ -166,7 +169,7 @@ def main() -> None:
             **{key: facts[key] for key in ("second", "alone", "once")},
         )  # fmt: skip
         over = np.log(np.maximum(facts["error"], 1e-4)) - np.log(sigma)
-        for label, among in (("matched", ~facts["alone"] & facts["level"]), ("predicted", facts["alone"])):
+        for label, among in (("matched", ~facts["second"] & facts["level"]), ("predicted", facts["alone"])):
             rows[name][f"{label}, within 1 / 2 sigma"] = shares(over[among])
     print(markdown(list(rows.values())))
 

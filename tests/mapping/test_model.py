@@ -79,4 +79,10 @@ def test_only_matches_between_images_of_the_model_count(monkeypatch: pytest.Monk
     assert model._upheld(Fake([0, 3], {}), NAMES, MATCHES) == 2, "they have none: nothing contradicts them"
     copy = Fake([0, 1], {})
     copy.centres[1] = copy.centres[0] + [0, 1, 0]
-    assert model._upheld(copy, NAMES, MATCHES) == 2, "from one place no point can be told"
+    assert model._upheld(copy, NAMES, MATCHES) == 0, "a model that has collapsed to a point is no good one"
+    hovered = Fake([0, 1, 2], {(1, 2): 100})
+    hovered.centres[0] = hovered.centres[1] + [0, 1, 0]
+    matches = {**MATCHES, (0, 2): 100}
+    assert model._upheld(hovered, NAMES, matches) == 2
+    hovered.common[0, 2] = 90
+    assert model._upheld(hovered, NAMES, matches) == 3, "from one place no point can be told, from others it can"

@@ -83,6 +83,14 @@ def test_ties_of_one_image_with_many_pairs_add_up() -> None:
     assert not unchecked_ties(bundle, ALL).any()
 
 
+def test_what_one_image_loses_is_no_tie_of_another() -> None:
+    """Of the first image's four ties three are also the second's, which has no more."""
+    bundle = line(PAIRS + FIRM + [(0, 1, 2)] * 3 + [(0, 3, 4)])
+    left = bundle.kept(~unchecked_ties(bundle, ALL))
+    assert untied(left).tolist() == [True, True, False, False, False]
+    assert not unchecked_ties(left, ALL).any()
+
+
 def test_images_without_position_keep_every_tie() -> None:
     """Nothing else holds these."""
     bundle = line([*PAIRS, *FIRM, (0, 1, 2)])

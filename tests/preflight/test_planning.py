@@ -228,7 +228,7 @@ def test_command(tmp_path, monkeypatch, capsys):
     assert not done.value.code
     said = capsys.readouterr().out
     assert "expected sigma in height" in said
-    assert "in images of 1600 px" in " ".join(said.split())
+    assert "in images of at most 1600 px" in " ".join(said.split())
     assert "131 m are above the 120 m" in said
     assert kml.is_file()
     monkeypatch.setattr("sys.argv", [*arguments, "--overlap", "200"])

@@ -94,16 +94,19 @@ def _upheld(model: Any, names: Sequence[str], matches: Mapping[tuple[int, int], 
     bundle = bundle_of(model, {name: i for i, name in enumerate(names)})
     row = {frame: k for k, frame in enumerate(bundle.frames.tolist())}
     links = bundle.links()
-    away = float(np.median(np.linalg.norm(bundle.points[bundle.point] - bundle.centres[bundle.image], axis=1)))
-    had, kept = np.zeros(len(bundle)), np.zeros(len(bundle))
+    rays = np.linalg.norm(bundle.points[bundle.point] - bundle.centres[bundle.image], axis=1)
+    away = float(np.median(rays)) if len(rays) else 0.0
+    matched, had, kept = np.zeros((3, len(bundle)))
     for (i, j), count in matches.items():
         if i in row and j in row:
             pair = [row[i], row[j]]
+            matched[pair] += count
             if np.linalg.norm(bundle.centres[pair[0]] - bundle.centres[pair[1]]) < NO_BASE * away:
                 continue
             had[pair] += count
             kept[pair] += min(count, links.get((min(pair), max(pair)), 0))
-    return int((kept >= KEPT * had).sum())
+    # An image all of whose partners stand where it does has nothing that speaks for it.
+    return int(((matched == 0) | ((had > 0) & (kept >= KEPT * had))).sum())
 
 
 def _left(names: Sequence[str], models: Sequence[Any]) -> list[str]:

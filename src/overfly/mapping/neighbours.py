@@ -15,7 +15,8 @@ CANDIDATES = 40
 """Nearest cameras that are looked at."""
 
 WIDE = 0.9
-"""Base-to-height ratio beyond which a pair is only better than none, as on circles with an image every 60 degrees."""
+"""Base-to-height ratio beyond which a pair counts only for ground that no better one has, as on circles with an image
+every 60 degrees."""
 
 REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
 """What seeing a place once more is worth: the first partner makes it measured, the later ones make it sure."""
@@ -76,12 +77,13 @@ def _partners(
     cosine = np.einsum("gk,jgk->jg", here, there) / np.maximum(lengths, 1e-12)
     base_to_height = 2 * np.tan(np.arccos(np.clip(cosine, -1, 1)) / 2)
     values = np.where(inside, _value(base_to_height, ratio), 0.0)
+    wide = {int(j): far for j, far in zip(near, base_to_height > WIDE, strict=True)}
     worth = {int(j): value for j, value in zip(near, values, strict=True) if value.mean() > 0.02}
     chosen: list[int] = []
     times = np.zeros(len(ground), int)
     while worth and len(chosen) < count:
         repeat = np.array([REPEATS[min(t, len(REPEATS) - 1)] for t in times])
-        gains = {j: float((value * repeat).mean()) for j, value in worth.items()}
+        gains = {j: float((value * repeat * (~wide[j] | (times == 0))).mean()) for j, value in worth.items()}
         best = max(gains, key=lambda j: (gains[j], -j))
         if gains[best] < 0.02:
             break
@@ -93,4 +95,6 @@ def _partners(
 def _value(base_to_height: Array, ratio: tuple[float, float]) -> Array:
     """1 between 0.15 and 0.45; less where depth is imprecise (narrow) or views differ too much (wide)."""
     low, high = ratio
-    return np.asarray(np.interp(base_to_height, [low, 0.15, 0.45, WIDE, high], [0, 1, 1, 0.3, 0]))
+    rise = (base_to_height - low) / max(0.15 - low, 1e-9)
+    fall = np.interp(base_to_height, [0.45, WIDE, max(high, WIDE)], [1, 0.3, 0])
+    return np.where((base_to_height > low) & (base_to_height < high), np.clip(np.minimum(rise, fall), 0, 1), 0.0)

@@ -54,7 +54,7 @@ def roughness(depth: Map, focal: float) -> NDArray[np.float32]:
         """Of the window, weighted by powers of the distance from its middle."""
         return np.asarray(cv2.sepFilter2D(values, -1, ramp**across, ramp**down, borderType=cv2.BORDER_CONSTANT))
 
-    n = np.maximum(total(weight), 1)
+    n = np.maximum(total(weight), 1).astype(np.float64)
     x, y, mean = total(weight, 1) / n, total(weight, 0, 1) / n, total(z) / n
     xx, yy, xy = total(weight, 2) / n - x * x, total(weight, 0, 2) / n - y * y, total(weight, 1, 1) / n - x * y
     xz, yz = total(z, 1) / n - x * mean, total(z, 0, 1) / n - y * mean

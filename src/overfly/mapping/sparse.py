@@ -23,7 +23,7 @@ WORSE = 2.0
 """Times by which reprojection errors may be larger where more images are placed."""
 
 GOOD_PX = 0.5
-"""Errors below which all bundles are alike."""
+"""Errors are compared with so much at least: those of a few wrong points may be zero."""
 
 
 def sparse_parts(

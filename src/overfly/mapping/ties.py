@@ -27,18 +27,21 @@ def unchecked_ties(bundle: Bundle, placed: NDArray[np.bool_]) -> NDArray[np.bool
         placed: images [n] whose GPS position is known. Tracks through others stay whole: nothing else holds these.
 
     Returns:
-        Of tracks through three images and more, the rays of images that have too few such tracks. Where fewer than two
-        others would be left of a track, the two images with most points in common keep theirs.
+        Of tracks through three images and more, the rays of images that have too few such tracks, but :data:`LEFT` rays
+        besides. Where fewer than two others would be left of a track, the two images with most points in common keep
+        theirs.
     """
     n, m = len(bundle), len(bundle.points)
     length = np.bincount(bundle.point, minlength=m)
-    tie = length[bundle.point] >= 3
     rays = np.bincount(bundle.image, minlength=n)
-    ties = np.bincount(bundle.image[tie], minlength=n)
-    weak = placed & (ties < np.maximum(FEWEST, SHARE * rays)) & (rays - ties >= LEFT)
     known = np.bincount(bundle.point[~placed[bundle.image]], minlength=m) == 0
-    out = tie & weak[bundle.image] & known[bundle.point]
-    left = length - np.bincount(bundle.point[out], minlength=m)
+    weak, before, left = np.zeros(n, bool), -1, length
+    while before < weak.sum():  # what one image loses may have been a tie of another
+        before = int(weak.sum())
+        ties = np.bincount(bundle.image[(left >= 3)[bundle.point] & ~weak[bundle.image]], minlength=n)
+        weak |= placed & (ties < np.maximum(FEWEST, SHARE * rays)) & (rays - ties >= LEFT)
+        out = (length >= 3)[bundle.point] & weak[bundle.image] & known[bundle.point]
+        left = length - np.bincount(bundle.point[out], minlength=m)
     links = bundle.links()
     start = np.cumsum(length) - length  # rays are ordered by point
     for point in np.flatnonzero((left < 2) & (length >= 3)).tolist():

@@ -16,7 +16,7 @@ from overfly.mapping.raster import Grid
 from overfly.preflight.accuracy import SIGMA_PX, sigma_xy_m, sigma_z_m
 from overfly.preflight.ground import Placement, lines_of
 
-SIGMA_OF = f"points matched to {SIGMA_PX} px in images of {SIZE} px (overfly map --size)"
+SIGMA_OF = f"points matched to {SIGMA_PX} px in images of at most {SIZE} px (overfly map --size)"
 """What the expected sigma supposes."""
 
 CELLS = 500
