@@ -10,6 +10,7 @@ import typer
 
 from overfly import __version__
 from overfly.errors import InputError
+from overfly.mapping.needs import SIZE
 
 app = typer.Typer(
     name="overfly",
@@ -153,7 +154,7 @@ def map_(
         str, typer.Option(help="Points of gcp_list.txt: split (a quarter only checks), all, or none.")
     ] = "split",
     dense: Annotated[str, typer.Option(help="sweep (network and stereo together) or stereo alone.")] = "sweep",
-    size: Annotated[int, typer.Option(help="Longest side at which images are matched, pixels.")] = 1600,
+    size: Annotated[int, typer.Option(help="Longest side at which images are matched, pixels.")] = SIZE,
     max_memory: Annotated[
         float | None,
         typer.Option(help="Memory for dense cloud and products, GB. Default: half of what is free, at most 6."),

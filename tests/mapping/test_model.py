@@ -15,12 +15,13 @@ MATCHES = {(0, 1): 100, (1, 2): 100, (2, 3): 100}
 
 
 class Fake:
-    """A model of some images with common points, as far as the choice looks at it."""
+    """A model and its bundle, as far as the choice looks at them."""
 
     def __init__(self, images: list[int], links: dict[tuple[int, int], int], points: int = 300) -> None:
-        self.frames, self.common, self.count = np.array(images), links, points
+        self.frames, self.common = np.array(images), links
         self.centres = np.array([[10.0 * i, 0, 50] for i in images])
-        self.points, self.point, self.image = np.zeros((1, 3)), np.zeros(1, int), np.zeros(1, int)
+        self.points = np.zeros((points, 3))
+        self.point, self.image = np.zeros(1, int), np.zeros(1, int)
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -28,16 +29,13 @@ class Fake:
     def links(self) -> dict[tuple[int, int], int]:
         return self.common
 
-    def num_reg_images(self) -> int:
-        return len(self.frames)
-
-    def num_points3D(self) -> int:
-        return self.count
-
 
 RIGHT = Fake([0, 1, 2, 3], {(0, 1): 98, (1, 2): 99, (2, 3): 95})
 WRONG = Fake([0, 1, 2, 3], {(0, 1): 98, (1, 2): 99, (2, 3): 10}, 400)
 """The last image has been put elsewhere."""
+
+TINY = Fake([0, 1, 2, 3], {(0, 1): 100, (1, 2): 100, (2, 3): 100}, 2)
+"""Two points fit without error, and say nothing."""
 
 
 @pytest.mark.parametrize(
@@ -47,6 +45,7 @@ WRONG = Fake([0, 1, 2, 3], {(0, 1): 98, (1, 2): 99, (2, 3): 10}, 400)
         ({3: WRONG, 2: RIGHT, 1: WRONG}, RIGHT, [3, 2]),
         ({3: WRONG, 2: WRONG, 1: RIGHT}, RIGHT, [3, 2, 1]),
         ({3: WRONG, 2: None, 1: None}, WRONG, [3, 2, 1]),
+        ({3: TINY, 2: WRONG, 1: None}, WRONG, [3, 2, 1]),
     ],
 )
 def test_a_model_that_puts_an_image_elsewhere_asks_for_another_way(
@@ -64,25 +63,23 @@ def test_a_model_that_puts_an_image_elsewhere_asks_for_another_way(
 
     monkeypatch.setattr(model, "read_verified", lambda *_: {k: np.zeros((n, 2)) for k, n in MATCHES.items()})
     monkeypatch.setattr(model, "bundle_of", lambda made, _: made)
-    monkeypatch.setattr(model, "_left", lambda names, models: [])
     monkeypatch.setattr(model, "_global", lambda *args: answer(args[4]))
     monkeypatch.setattr(model, "_incremental", lambda *_: answer(1))
     assert model.mapped(tmp_path / "db", tmp_path, tmp_path, names=NAMES, seed=0) == [taken]
     assert tried == asked
 
 
-def test_only_matches_between_images_of_the_model_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_matches_between_images_of_the_model_count() -> None:
     half = Fake([0, 1], {(0, 1): 50})
-    monkeypatch.setattr(model, "bundle_of", lambda made, _: made)
-    assert model._upheld(half, NAMES, MATCHES) == 2
-    assert model._upheld(Fake([0, 1], {(0, 1): 49}), NAMES, MATCHES) == 0
-    assert model._upheld(Fake([0, 3], {}), NAMES, MATCHES) == 2, "they have none: nothing contradicts them"
+    assert model._upheld(half, MATCHES) == 2
+    assert model._upheld(Fake([0, 1], {(0, 1): 49}), MATCHES) == 0
+    assert model._upheld(Fake([0, 3], {}), MATCHES) == 2, "they have none: nothing contradicts them"
     copy = Fake([0, 1], {})
     copy.centres[1] = copy.centres[0] + [0, 1, 0]
-    assert model._upheld(copy, NAMES, MATCHES) == 0, "a model that has collapsed to a point is no good one"
+    assert model._upheld(copy, MATCHES) == 0, "a model that has collapsed to a point is no good one"
     hovered = Fake([0, 1, 2], {(1, 2): 100})
     hovered.centres[0] = hovered.centres[1] + [0, 1, 0]
     matches = {**MATCHES, (0, 2): 100}
-    assert model._upheld(hovered, NAMES, matches) == 2
+    assert model._upheld(hovered, matches) == 2
     hovered.common[0, 2] = 90
-    assert model._upheld(hovered, NAMES, matches) == 3, "from one place no point can be told, from others it can"
+    assert model._upheld(hovered, matches) == 3, "from one place no point can be told, from others it can"

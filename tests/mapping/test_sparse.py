@@ -16,8 +16,8 @@ from overfly.mapping import sparse
 class Part:
     """A bundle, as far as the choice looks at it."""
 
-    def __init__(self, name: str, images: int, error: float = 0.2, points: int = 50) -> None:
-        self.name, self.images, self.error, self.points = name, images, error, np.zeros((points, 3))
+    def __init__(self, name: str, images: int, error: float = 0.2) -> None:
+        self.name, self.images, self.error = name, images, error
 
     def __len__(self) -> int:
         return self.images
@@ -43,8 +43,6 @@ HELD, FREE, PRIOR = Part("held", 20), Part("free", 20), Part("prior", 20)
         (HELD, FREE, None, False, 0, "held", ["held", "prior"]),
         (None, None, PRIOR, True, 0, "prior", ["held", "free", "prior"]),
         (Part("held", 19), FREE, None, True, 0, "free", ["held", "free"]),
-        # Two images and two points fit without error, and say nothing.
-        (Part("held", 2, 0.0, 2), Part("free", 11), PRIOR, True, 0, "prior", ["held", "free", "prior"]),
         (Part("held", 12, 0.01), Part("free", 11), PRIOR, True, 0, "prior", ["held", "free", "prior"]),
     ],
 )
@@ -71,7 +69,6 @@ def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_neede
         return prior
 
     monkeypatch.setattr(sparse, "mapped", mapped)
-    monkeypatch.setattr(sparse, "bundle_of", lambda model, _: model)
     monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: agrees)
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
     monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
@@ -118,7 +115,6 @@ def test_more_matches_are_asked_for_where_they_are_too_few(
     monkeypatch.setattr(
         sparse, "mapped", lambda database, *_, **__: [p] if (p := by_database[database.name]) is not None else []
     )
-    monkeypatch.setattr(sparse, "bundle_of", lambda model, _: model)
     monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_: part.name != against)
     monkeypatch.setattr(sparse, "read_points", lambda database, _: (read.append(database.name), []))
     monkeypatch.setattr(sparse, "read_verified", lambda *_: {})

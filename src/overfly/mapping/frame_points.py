@@ -137,6 +137,7 @@ def frame_points(
     depth: Map = data["depth"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
     second = data.get("second", guessed)
+    once = data.get("once", np.zeros(depth.shape, bool))
     seen = compared(own, data, second, partners)
     agree = seen.agree
     # Partners that have the place inside and say nothing, or something else, beyond the one that every pair leaves out.
@@ -148,12 +149,12 @@ def frame_points(
     known &= guessed | several | (data["score"] > WORST_SCORE[False] + UNMATCHED * silent - 0.005)
     alone = guessed & (agree == 0)  # predicted: no other frame agrees
     if "once" in data:
-        alone &= data["once"] | (data["sure"] > SURE_THOUGH_SEEN + SURER * silent)
+        alone &= once | (data["sure"] > SURE_THOUGH_SEEN + SURER * silent)
     own_word = data["sure"] if "sure" in data else np.float32(0)
     confidence = np.where(guessed, own_word, _confidence(votes, agree, data["score"])).astype(np.float32)
     doubted = second & ~alone & (confidence < np.where(silent > 0, AGREED, AGREED_UNSEEN))
     exact = seen.sigma * own.camera.fx <= EXACT_NEAR * depth
-    near = np.where(alone, data.get("once", False) & exact, (silent == 0) | (confidence >= AGREED_NEAR))
+    near = np.where(alone, once & exact, (silent == 0) | (confidence >= AGREED_NEAR))
     apart = np.where(second, np.where(near, NEAR, AWAY), 0).astype(np.uint8)
     image, shown = _shown(frame, own)
     known = (known | alone) & shown
@@ -165,7 +166,6 @@ def frame_points(
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
     points = unproject(pixels, merged, own.camera, own.world_from_camera)
     rough = roughness(np.where(known, seen.depth, np.float32(np.nan)), own.camera.fx)
-    once = data.get("once", np.zeros(depth.shape, bool))
     sigma = point_sigmas(
         rough[fresh], agree[fresh], data["score"][fresh], confidence[fresh], seen.sigma[fresh], merged, own.camera.fx,
         second=second[fresh], alone=alone[fresh], once=once[fresh],

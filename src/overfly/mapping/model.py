@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from overfly.mapping.bundle import bundle_of
+from overfly.mapping.bundle import Bundle, bundle_of
 from overfly.mapping.database import read_verified
 
 log = logging.getLogger("overfly")
@@ -38,8 +38,8 @@ THREADS = 1
 
 def mapped(
     database: Path, images: Path, workdir: Path, *, names: Sequence[str], seed: int, calibrate: bool = True
-) -> list[Any]:
-    """Models without common frames, the largest first; empty where no two frames could be placed.
+) -> list[Bundle]:
+    """Bundles without common images, the largest first; empty where no two frames could be placed.
 
     Global mapping with tracks of three frames or more is tried first; at 30 % overlap most ground is seen twice only,
     so that frames left out ask for two-view tracks, and then for incremental mapping, which places them one by one. So
@@ -48,54 +48,59 @@ def mapped(
     that the database has.
     """
     matches = {pair: len(rows) for pair, rows in read_verified(database, names).items()}
-    best: _Judged | None = None
+    numbers = {name: i for i, name in enumerate(names)}
 
-    def better(models: dict[int, Any]) -> _Judged | None:
-        judged = [_Judged(model, _upheld(model, names, matches)) for model in models.values()]
+    def bundled(models: dict[int, Any]) -> list[tuple[Any, Bundle]]:
+        """The models with points enough: the others are what is left of wrong matches."""
+        pairs = [(model, bundle_of(model, numbers)) for model in models.values()]
+        return [(model, bundle) for model, bundle in pairs if len(bundle.points) >= FEWEST_MATCHES]
+
+    def better(best: _Judged | None, models: dict[int, Any]) -> _Judged | None:
+        judged = [_Judged(model, bundle, _upheld(bundle, matches)) for model, bundle in bundled(models)]
         return max([m for m in (best, *judged) if m is not None], key=_Judged.worth, default=None)
 
+    best = None
     for views in (3, 2):
         if views == 3 and len(names) < 3:
             continue
-        best = better(_global(database, images, _folder(workdir / f"global{views}"), names, views, seed, calibrate))
+        more = _global(database, images, _folder(workdir / f"global{views}"), names, views, seed, calibrate)
+        best = better(best, more)
         if best is not None and best.good(len(names)):
-            return [best.model]
-    best = better(_incremental(database, images, _folder(workdir / "incremental"), names, seed, calibrate))
+            return [best.bundle]
+    best = better(best, _incremental(database, images, _folder(workdir / "incremental"), names, seed, calibrate))
     if best is None:
         return []
-    if _left(names, [best.model]):
-        best = better(_extended(best.model, database, images, workdir, seed))
-        assert best is not None
-    models = [best.model]
-    while len(left := _left(names, models)) >= 2:
-        more = _incremental(database, images, _folder(workdir / f"part{len(models)}"), left, seed, calibrate)
-        part = max(more.values(), key=lambda model: model.num_reg_images(), default=None)
-        if part is None or part.num_reg_images() < 2:
+    if len(best.bundle) < len(names):
+        best = better(best, _extended(best.model, database, images, workdir, seed)) or best
+    bundles = [best.bundle]
+    while len(left := _left(names, bundles)) >= 2:
+        more = _incremental(database, images, _folder(workdir / f"part{len(bundles)}"), left, seed, calibrate)
+        part = max((bundle for _, bundle in bundled(more)), key=len, default=None)
+        if part is None or len(part) < 2:
             break
-        models.append(part)
-    return sorted(models, key=lambda model: -model.num_reg_images())
+        bundles.append(part)
+    return sorted(bundles, key=len, reverse=True)
 
 
 class _Judged(NamedTuple):
-    """A model, and how many of its images keep their matches."""
+    """A model, its bundle, and how many of its images keep their matches."""
 
     model: Any
+    bundle: Bundle
     upheld: int
 
     def worth(self) -> tuple[int, int, int]:
-        return self.upheld, self.model.num_reg_images(), self.model.num_points3D()
+        return self.upheld, len(self.bundle), len(self.bundle.points)
 
     def good(self, images: int) -> bool:
-        return self.model.num_reg_images() == images and self.upheld >= (1 - CONTRADICTED) * images
+        return len(self.bundle) == images and self.upheld >= (1 - CONTRADICTED) * images
 
 
-def _upheld(model: Any, names: Sequence[str], matches: Mapping[tuple[int, int], int]) -> int:
-    """How many images of a model keep their matches with its other images."""
-    bundle = bundle_of(model, {name: i for i, name in enumerate(names)})
+def _upheld(bundle: Bundle, matches: Mapping[tuple[int, int], int]) -> int:
+    """How many images of a bundle keep their matches with its other images."""
     row = {frame: k for k, frame in enumerate(bundle.frames.tolist())}
     links = bundle.links()
-    rays = np.linalg.norm(bundle.points[bundle.point] - bundle.centres[bundle.image], axis=1)
-    away = float(np.median(rays)) if len(rays) else 0.0
+    away = float(np.median(np.linalg.norm(bundle.points[bundle.point] - bundle.centres[bundle.image], axis=1)))
     matched, had, kept = np.zeros((3, len(bundle)))
     for (i, j), count in matches.items():
         if i in row and j in row:
@@ -109,9 +114,9 @@ def _upheld(model: Any, names: Sequence[str], matches: Mapping[tuple[int, int], 
     return int(((matched == 0) | ((had > 0) & (kept >= KEPT * had))).sum())
 
 
-def _left(names: Sequence[str], models: Sequence[Any]) -> list[str]:
-    placed = {model.images[i].name for model in models for i in model.reg_image_ids()}
-    return [name for name in names if name not in placed]
+def _left(names: Sequence[str], bundles: Sequence[Bundle]) -> list[str]:
+    placed = {i for bundle in bundles for i in bundle.frames.tolist()}
+    return [name for i, name in enumerate(names) if i not in placed]
 
 
 def _global(

@@ -75,7 +75,7 @@ Sizes = Iterable[tuple[int, int]]
 """Widths and heights of images, pixels."""
 
 
-def budget(sizes: Sizes, allowed_gb: float, matched_side: int = 1600, *, network: bool = True) -> Budget:
+def budget(sizes: Sizes, allowed_gb: float, matched_side: int = SIZE, *, network: bool = True) -> Budget:
     """What fits into ``allowed_gb``; the smallest possible if nothing does (:func:`least_gb`)."""
     sizes = list(sizes)
     fixed, largest, _ = _parts(sizes, matched_side, network)
@@ -91,12 +91,12 @@ def budget(sizes: Sizes, allowed_gb: float, matched_side: int = 1600, *, network
     )
 
 
-def memory_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
+def memory_gb(sizes: Sizes, matched_side: int = SIZE, *, network: bool = True) -> float:
     """Memory that a map takes if enough is there, GB."""
     return _needed(sizes, matched_side, network, TILE_POINTS[1], HELD_MAPS[1], SAMPLE[1], cores())
 
 
-def least_gb(sizes: Sizes, matched_side: int = 1600, *, network: bool = True) -> float:
+def least_gb(sizes: Sizes, matched_side: int = SIZE, *, network: bool = True) -> float:
     """Memory that a map takes with the smallest tiles and the fewest images in memory, GB."""
     return _needed(sizes, matched_side, network, TILE_POINTS[0], HELD_MAPS[0], SAMPLE[0], 1)
 
@@ -134,7 +134,7 @@ def free_gb() -> float:
     return max(free, 0) / 1e9
 
 
-def core_seconds(sizes: Sizes, matched_side: int = 1600) -> float:
+def core_seconds(sizes: Sizes, matched_side: int = SIZE) -> float:
     """Time that the map takes on one core, if images are matched at a longest side of ``matched_side`` pixels."""
     return CORE_SECONDS_PER_MEGAPIXEL * sum(_matched(size, matched_side) for size in sizes) / 1e6
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from overfly.flights import Flight
 from overfly.geometry import Array
-from overfly.mapping.bundle import Bundle, bundle_of, components
+from overfly.mapping.bundle import Bundle, components
 from overfly.mapping.by_priors import bundle_by_priors
 from overfly.mapping.database import read_points, read_verified
 from overfly.mapping.matches import Bar
-from overfly.mapping.model import FEWEST_MATCHES, mapped
+from overfly.mapping.model import mapped
 from overfly.mapping.placing import agrees_with_gps
 
 ENOUGH = 0.95
@@ -56,13 +56,10 @@ def sparse_parts(
         more: makes a database of more matches.
     """
     names = [frame.name for frame in flight.frames]
-    numbers = {name: i for i, name in enumerate(names)}
     calibrated = all(frame.calibration is not None for frame in flight.frames)
 
     def found(folder: Path, calibrate: bool) -> list[Bundle]:
-        models = mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
-        parts = [bundle_of(model, numbers) for model in models]
-        return [part for part in parts if len(part.points) >= FEWEST_MATCHES]  # the others are left of wrong matches
+        return mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
 
     def built_up(folder: Path) -> list[Bundle]:
         held = [] if len(guessed) == len(names) else found(folder / "held", calibrate=False)

@@ -25,6 +25,7 @@ from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_map import DepthMap, Map, Opinion
 from overfly.mapping.depth_ranges import Span, depth_ranges
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
+from overfly.mapping.needs import SIZE
 from overfly.mapping.neighbours import choose_partners
 from overfly.mapping.rectify import Rectified, ordered, rectify
 from overfly.mapping.subpixel import refine
@@ -54,7 +55,7 @@ def stereo(
     *,
     workdir: Path,
     points: Array | None = None,
-    max_size: int = 1600,
+    max_size: int = SIZE,
     neighbours: int = 4,
     seed: int = 0,
     opinions: Callable[[Views, Array], Opinions] | None = None,

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import math
 
+from overfly.mapping.needs import SIZE
+
 SIGMA_PX = 0.3
 """How well a point of good texture is matched, pixels (one sigma)."""
+
+SIGMA_OF = f"points matched to {SIGMA_PX} px in images of at most {SIZE} px (overfly map --size)"
+"""What the expected sigma supposes."""
 
 
 def sigma_z_m(gsd_m: float, base_to_height: float, sigma_px: float = SIGMA_PX) -> float:

@@ -15,7 +15,8 @@ from overfly.flights import Flight, read_flight
 from overfly.geometry import Array
 from overfly.mapping.needs import core_seconds, memory_gb
 from overfly.mapping.report import duration, length_text
-from overfly.preflight.coverage import SIGMA_OF, Coverage, cover
+from overfly.preflight.accuracy import SIGMA_OF
+from overfly.preflight.coverage import Coverage, cover
 from overfly.preflight.findings import Finding, count, ranked
 from overfly.preflight.gaps import Gap, gaps_of
 from overfly.preflight.ground import Placement, place

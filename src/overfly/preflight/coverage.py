@@ -13,11 +13,8 @@ from overfly.data.footprints import footprint, ground_overlaps
 from overfly.geometry import Array
 from overfly.mapping.needs import SIZE
 from overfly.mapping.raster import Grid
-from overfly.preflight.accuracy import SIGMA_PX, sigma_xy_m, sigma_z_m
+from overfly.preflight.accuracy import sigma_xy_m, sigma_z_m
 from overfly.preflight.ground import Placement, lines_of
-
-SIGMA_OF = f"points matched to {SIGMA_PX} px in images of at most {SIZE} px (overfly map --size)"
-"""What the expected sigma supposes."""
 
 CELLS = 500
 """Cells along the longer side of the raster."""
