@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from overfly.cloud import Cloud
+from overfly.flights import Frame
 from overfly.geometry import Array, Camera, pixel_grid, pose, rays, rotation_from_gimbal
 from overfly.mapping import walls
+from overfly.mapping.depth_map import DepthMap
+from overfly.mapping.frame_points import frame_points
 from overfly.mapping.raster import Grid, Surface
 from overfly.mapping.thinning import BLOCK, WALL, thinned_tile
 from overfly.mapping.walls import wall_points
@@ -66,6 +73,46 @@ def test_a_guess_beside_a_roof_is_no_ground() -> None:
     measured[:, :235] = False  # all ground before the wall
     assert not len(wall_points(depth, measured, CAMERA, DOWN)[0])
     assert not len(wall_points(np.full_like(depth, np.nan), measured, CAMERA, DOWN)[0])
+
+
+def test_another_frame_tells_the_ground_that_this_one_could_not_match() -> None:
+    depth = house()
+    measured = np.isfinite(depth)
+    measured[:, :235] = False  # all ground before the wall
+    depth[:, :235] = np.nan
+    ground = np.stack([*np.mgrid[-30:8:0.2, -20:20:0.2].reshape(2, -1), np.zeros(38000)], axis=1)
+    points, *_ = wall_points(depth, measured, CAMERA, DOWN, [ground])
+    assert len(points) > 1000
+    assert np.abs(points[:, 0] - WEST).max() < 0.8
+    ground[:, 2] = 8.5  # a terrace under the roof's edge: too low a step for a wall
+    assert not len(wall_points(depth, measured, CAMERA, DOWN, [ground])[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "stands"),
+    [({}, True), ({"second": True}, False), ({"support": 1, "score": 0.4}, False), ({"support": 1}, True)],
+)
+def test_only_what_another_frame_has_surely_measured_makes_a_wall(
+    change: dict[str, Any], stands: bool, tmp_path: Path
+) -> None:
+    """The other frame stands 20 m to the west and has matched the ground before the wall, which this one has not."""
+    shape = CAMERA.height, CAMERA.width
+    kinds = {"depth": np.float32, "sigma": np.float32, "score": np.float32, "support": np.uint8, "second": bool}
+    facts = {"depth": 75, "sigma": 0.1, "score": 0.9, "support": 2, "second": False}
+    depth, ground = house(), {name: np.full(shape, (facts | change)[name], kinds[name]) for name in kinds}
+    depth[:, :235] = np.nan
+    own = {**ground, "depth": depth, "second": np.isnan(depth), "support": np.full(shape, 2, np.uint8)}
+    own["score"] = np.ones(shape, np.float32)
+    aside = DOWN.copy()
+    aside[0, 3] = -20
+    ground["depth"][:, 300:] = np.nan  # it does not see the ground behind the house
+    frame = Frame("a", tmp_path / "a.png", CAMERA.width, CAMERA.height, camera=CAMERA)
+    Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
+    maps = [DepthMap(name, CAMERA, place, [], tmp_path / name) for name, place in (("a", DOWN), ("b", aside))]
+    _, apart, *_ = frame_points(maps[0], own, [(maps[1], ground, None)], frame, single=True, walls=True)
+    assert (np.count_nonzero(apart >= WALL) > 1000) == stands
+    _, apart, *_ = frame_points(maps[0], own, [(maps[1], ground, None)], frame, single=True, walls=False)
+    assert not (apart >= WALL).any()
 
 
 def test_a_deck_under_which_the_ground_was_matched_has_no_walls() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from overfly.mapping.depth_map import DepthMap, Opinion
 from overfly.mapping.point_sigma import point_sigmas, roughness
 from overfly.mapping.subpixel import Map
 from overfly.mapping.thinning import WALL
-from overfly.mapping.walls import CONFIDENCE, SIGMA, wall_points
+from overfly.mapping.walls import CONFIDENCE, SIGMA, looked_up, measured_points, wall_points
 
 WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
@@ -47,6 +47,9 @@ deviations off or less, weighted by a Gaussian of so many of its pixels; the few
 
 SPECK, ISLAND, ISLAND_SCORE = 15, 40, 0.7
 """Connected pieces of depth with fewer pixels are speckle; pieces up to the second size must correlate so well."""
+
+SURELY = 0.5
+"""Correlation from which on what one pair has matched serves as roof or ground of the walls in other frames."""
 
 CONNECTED = 32
 """Standard deviations that neighbouring pixels of a piece may be apart: 8 pixels of disparity, as on walls."""
@@ -138,7 +141,8 @@ def frame_points(
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
     second = data.get("second", guessed)
     once = data.get("once", np.zeros(depth.shape, bool))
-    seen = compared(own, data, second, partners)
+    around: list[NDArray] = []
+    seen = compared(own, data, second, _noted(own, partners, around) if walls else partners)
     agree = seen.agree
     # Partners that have the place inside and say nothing, or something else, beyond the one that every pair leaves out.
     silent = np.maximum(seen.visible.astype(np.int8) - np.maximum(agree, 1), 0)
@@ -181,17 +185,36 @@ def frame_points(
     apart = apart[fresh]
     if walls:
         left = np.where(known, seen.depth, np.float32(np.nan))
-        cloud, apart = _with_walls(cloud, apart, np.where(shown, left, np.float32(np.inf)), second, own, image)
+        left = np.where(shown, left, np.float32(np.inf))
+        cloud, apart = _with_walls(cloud, apart, left, second, own, image, around)
     measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
     gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
     return cloud, apart, known, gsd
 
 
+def _noted(own: DepthMap, partners: Iterable[Partner], around: list[NDArray]) -> Iterator[Partner]:
+    """The partners as they come; what each has surely measured inside a frame is noted in ``around``, points [M, 3]."""
+    for partner, data, given in partners:
+        sure = (data["support"] >= 2) | (data["score"] >= SURELY)
+        if "second" in data:
+            sure &= ~data["second"]
+        depth = np.where(sure, data["depth"], np.float32(np.nan))
+        points = measured_points(depth, partner.camera, partner.world_from_camera)
+        around.append(points[looked_up(points, own.camera, own.world_from_camera)[-1]])
+        yield partner, data, given
+
+
 def _with_walls(
-    cloud: Cloud, apart: NDArray[np.uint8], depth: Map, second: NDArray[np.bool_], own: DepthMap, image: NDArray
+    cloud: Cloud,
+    apart: NDArray[np.uint8],
+    depth: Map,
+    second: NDArray[np.bool_],
+    own: DepthMap,
+    image: NDArray,
+    around: list[NDArray],
 ) -> tuple[Cloud, NDArray[np.uint8]]:
     """The points of a frame, and what it shows of walls that nobody has matched."""
-    points, rows, columns, voxels = wall_points(depth, ~second, own.camera, own.world_from_camera)
+    points, rows, columns, voxels = wall_points(depth, ~second, own.camera, own.world_from_camera, around)
     n = len(points)
     gsd = np.linalg.norm(points - own.world_from_camera[:3, 3], axis=1) / own.camera.fx
     walls = Cloud(

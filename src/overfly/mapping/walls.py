@@ -6,6 +6,8 @@ and below it is measured, though, and between the two nothing else can be.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,15 +65,17 @@ in ground pixels, on rendered flights at 50 % over blocks, campus and suburb."""
 
 
 def wall_points(
-    depth: Map, measured: NDArray[np.bool_], camera: Camera, world_from_camera: Array
+    depth: Map, measured: NDArray[np.bool_], camera: Camera, world_from_camera: Array, around: Sequence[Array] = ()
 ) -> tuple[Array, NDArray[np.intp], NDArray[np.intp], int]:
     """Points on the walls that a frame shows in its blank pixels.
 
     Args:
         depth: [H, W] of the frame, metres, NaN where blank, infinite where the lens shows nothing.
-        measured: where pairs have matched it; elsewhere it is a guess, beside which no wall is told.
+        measured: where pairs have matched it; elsewhere it is a guess, of which no roof and no ground is made.
         camera: undistorted, of the same size.
         world_from_camera: [4, 4], z up.
+        around: points [M, 3] inside the image that other frames have measured: what hides the ground here need not hide
+            it there.
 
     Returns:
         Points [N, 3] a ground pixel apart, the rows and columns [N] that show them, and how many ground pixels wide the
@@ -79,24 +83,20 @@ def wall_points(
     """
     nothing = np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp), 1
     blank = np.isnan(depth)
-    if not (np.isfinite(depth) & measured).any():
+    points = measured_points(np.where(measured, depth, np.nan), camera, world_from_camera, PIXELS)
+    if not len(points):
         return nothing
     middle = float(np.median(depth[np.isfinite(depth) & measured]))
     gsd = middle / camera.fx
     cell = max(CELL_M, CELL_PIXELS * gsd)
-    step = max(1, int(cell / gsd / PIXELS))
-    rows, columns = (k * step for k in np.nonzero(depth[::step, ::step] < FARTHEST * middle))
-    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
-    points = unproject(pixels, depth[rows, columns], camera, world_from_camera)
-    seen = surface(Cloud(points, predicted=~measured[rows, columns]), grid_over(points, cell, trim=0.0005))
+    points = np.concatenate([points, *around])
+    seen = surface(Cloud(points), grid_over(points, cell, trim=0.0005))
     found, outward = _curtains(seen, gsd)
     if not len(found):
         return nothing
     facing = ((world_from_camera[:2, 3] - found[:, :2]) * outward).sum(1) > 0
     found, outward = found[facing], outward[facing]
-    at, away = project(found, camera, world_from_camera)
-    column, row = np.floor(np.nan_to_num(at, nan=-1)).astype(np.intp).T
-    inside = (away > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    row, column, away, inside = looked_up(found, camera, world_from_camera)
     shown = np.flatnonzero(inside)
     shown = shown[blank[row[shown], column[shown]]]
     flat = row[shown] * camera.width + column[shown]
@@ -108,12 +108,33 @@ def wall_points(
     return found[shown], row[shown], column[shown], voxels
 
 
+def looked_up(
+    points: Array, camera: Camera, world_from_camera: Array
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, NDArray[np.bool_]]:
+    """Row, column and depth [N] at which an image has points [N, 3], and which of them lie inside of it."""
+    at, away = project(points, camera, world_from_camera)
+    column, row = np.floor(np.nan_to_num(at, nan=-1)).astype(np.intp).T
+    return row, column, away, (away > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+
+
+def measured_points(depth: Map, camera: Camera, world_from_camera: Array, pixels: int = 1) -> Array:
+    """What a depth map [H, W] holds, so many pixels along a cell: points [N, 3]; not what is farther than most."""
+    known = np.isfinite(depth)
+    if not known.any():
+        return np.zeros((0, 3))
+    middle = float(np.median(depth[known]))
+    gsd = middle / camera.fx
+    step = max(1, int(max(CELL_M, CELL_PIXELS * gsd) / gsd / pixels))
+    with np.errstate(invalid="ignore"):
+        rows, columns = (k * step for k in np.nonzero(depth[::step, ::step] < FARTHEST * middle))
+    at = np.stack([columns + 0.5, rows + 0.5], axis=1)
+    return unproject(at, depth[rows, columns], camera, world_from_camera)
+
+
 def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
     """Points [N, 3] one ground pixel apart under the edges of roofs, and the way [N, 2] that each wall faces."""
     cell, step = seen.grid.cell, max(STEP_M, STEP_PIXELS * gsd)
-    told = seen.filled if seen.predicted is None else seen.filled & ~(seen.predicted > 0.5)
-    measured = np.where(told, seen.heights, np.nan)
-    roof, ground = _roofs(measured, cell, max(FLAT_M, FLAT_PIXELS * gsd))
+    roof, ground = _roofs(seen.heights, cell, max(FLAT_M, FLAT_PIXELS * gsd))
     margin = GAP + 1
     z = np.pad(seen.heights, margin, constant_values=np.nan)
     roof, ground = np.pad(roof, margin), np.pad(ground, margin)
