@@ -35,7 +35,7 @@ def test_products_above_the_sea(geoid, tmp_path: Path) -> None:  # type: ignore[
     flight = make_flight(tmp_path / "flight", block={"altitude": 55.0, "origin": ORIGIN})
     plain = mapped(flight, tmp_path / "plain", ply=True)
     sea = mapped(flight, tmp_path / "sea", heights="egm96", ply=True)
-    assert (plain["crs"], plain["heights"]) == ("EPSG:32615", "ellipsoid")
+    assert (plain["crs"], plain["heights"]) == ("EPSG:32615", "ellipsoidal")
     assert (sea["crs"], sea["heights"]) == ("EPSG:32615+5773", "EPSG:5773")
     assert any("no geoid is applied" in words for words in plain["warnings"])
     assert not any("geoid" in words for words in sea["warnings"])

@@ -88,6 +88,18 @@ def test_report_is_one_file_with_the_numbers(tmp_path: Path) -> None:
     assert len(re.findall(r"data:image/png;base64,", html)) == 2
 
 
+@pytest.mark.parametrize(
+    ("heights", "words"),
+    [
+        ("ellipsoidal", "coordinates in EPSG:32615, ellipsoidal heights"),
+        ("EPSG:5773", "coordinates in EPSG:32615, heights in EPSG:5773"),
+        ("controls", "coordinates in EPSG:32615, heights as the ground control has them"),
+    ],
+)
+def test_the_report_says_what_heights_refer_to(heights: str, words: str, tmp_path: Path) -> None:
+    assert words in write(tmp_path, summary(heights=heights), []).text
+
+
 def test_unknown_scale_is_said_everywhere(tmp_path: Path) -> None:
     facts = summary(metric=False, crs=None, gps_rms=None, gsd_m=None)
     found = cautions(facts, altitudes={}, has_gps=False)
@@ -111,14 +123,14 @@ def test_every_caution_has_its_cause() -> None:
         "disagree with the images by 9.0 m": {"gps_rms": {"horizontal_m": 9.0, "vertical_m": None}},
         "no place on the Earth": {"crs": None, "cameras_from": "transforms.json"},
         "reprojection error is 2.1 px": {"reprojection_px": 2.1},
-        "no geoid is applied": {"heights": "ellipsoid", "settings": {"heights": None}},
+        "no geoid is applied": {"heights": "ellipsoidal", "settings": {"heights": None}},
     }
     for words, change in cases.items():
         found = cautions(summary(**change), altitudes={}, has_gps=True)
         assert len(found) == 1, (words, found)
         assert words in found[0].what
         assert found[0].advice
-    meant = summary(heights="ellipsoid", settings={"heights": "ellipsoidal"})
+    meant = summary(heights="ellipsoidal", settings={"heights": "ellipsoidal"})
     assert cautions(meant, altitudes={}, has_gps=True) == []
     wrong = cautions(summary(), altitudes={"a": (120.0, 60.0), "b": (118.0, 60.0), "c": (None, 60.0)}, has_gps=True)
     assert "119 m above the mapped ground" in wrong[0].what

@@ -107,7 +107,7 @@ def _about_far_off(far: Sequence[str], told: str) -> Iterator[Caution]:
 
 
 def _about_geoid(summary: Mapping[str, Any]) -> Iterator[Caution]:
-    if summary["heights"] == "ellipsoid" and summary["settings"]["heights"] is None:
+    if summary["heights"] == "ellipsoidal" and summary["settings"]["heights"] is None:
         yield Caution(
             "Heights are those of the origin or the images' GPS, taken as above the ellipsoid: no geoid is applied.",
             "For heights above the sea map with --heights egm96 or the EPSG code of a vertical CRS, for which PROJ "

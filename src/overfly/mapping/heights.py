@@ -74,7 +74,7 @@ def check_heights(block: Block) -> None:
 
 
 def heights_of(block: Block) -> str | None:
-    """What the products' heights refer to: ``EPSG:5773``, ``ellipsoid``, ``controls`` (as they have them); or None.
+    """What the products' heights refer to: ``EPSG:5773``, ``ellipsoidal``, ``controls`` (as they have them); or None.
 
     Heights of GPS are taken as over the ellipsoid, which not every receiver writes.
     """
@@ -82,7 +82,7 @@ def heights_of(block: Block) -> str | None:
         return None
     if block.origin.vertical_epsg is not None:
         return f"EPSG:{block.origin.vertical_epsg}"
-    return "controls" if _held_by_controls(block) else "ellipsoid"
+    return "controls" if _held_by_controls(block) else "ellipsoidal"
 
 
 def _held_by_controls(block: Block) -> bool:
