@@ -85,5 +85,11 @@ def heights_of(block: Block) -> str | None:
     return "controls" if _held_by_controls(block) else "ellipsoidal"
 
 
+def heights_text(heights: str | None) -> str:
+    """What heights refer to, in words; see :func:`heights_of`."""
+    kinds = {"ellipsoidal": "ellipsoidal heights", "controls": "heights as the ground control has them"}
+    return "" if heights is None else kinds.get(heights, f"heights in {heights}")
+
+
 def _held_by_controls(block: Block) -> bool:
     return block.survey is not None and block.survey.sigma_m is not None

@@ -13,6 +13,7 @@ from typing import Any
 from overfly import __version__
 from overfly.files import replacing
 from overfly.mapping.gaps import SOURCES
+from overfly.mapping.heights import heights_text
 
 
 @dataclass(frozen=True)
@@ -111,16 +112,10 @@ def write_report(
         version=__version__,
         unit_name="metres" if summary["metric"] else "units of unknown length",
         crs=summary["crs"],
-        heights=_heights_text(summary["heights"]),
+        heights=heights_text(summary["heights"]),
     )
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
-
-
-def _heights_text(heights: str | None) -> str:
-    """What heights refer to, in words; see :func:`overfly.mapping.heights.heights_of`."""
-    kinds = {"ellipsoidal": "ellipsoidal heights", "controls": "heights as the ground control has them"}
-    return "" if heights is None else kinds.get(heights, f"heights in {heights}")
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
