@@ -14,9 +14,10 @@ import torch
 from conftest import bar
 from overfly.errors import InputError
 from overfly.flights import Flight
+from overfly.flights.locate import gps_frame
 from overfly.geometry import fit_similarity, project, transform
 from overfly.losses import correspondence
-from overfly.mapping.align import align, gps_frame
+from overfly.mapping.align import align
 from overfly.mapping.correlate import refine
 from overfly.mapping.encoder_matches import match_pair, overlay, picture
 from overfly.mapping.matches import encoder_matches, priors

@@ -325,8 +325,8 @@ def test_a_frame_whose_z_is_not_up_gets_no_rasters_and_keeps_its_cloud(tmp_path:
     data = json.loads((flight / "transforms.json").read_text())
     turn = pose(rotation_from_gimbal(40, -10, 30), [0, 0, 0])
     from overfly.flights import read_flight
-    from overfly.mapping.block import given_block
     from overfly.mapping.deliver import deliver
+    from overfly.mapping.given import given_block
     from overfly.mapping.steps import Steps
 
     upright_block = given_block(read_flight(flight))

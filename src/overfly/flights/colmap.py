@@ -61,6 +61,32 @@ def read_colmap_cameras(file: Path) -> dict[int, Camera]:
         return _binary_cameras(file) if file.suffix == ".bin" else _text_cameras(file)
 
 
+def read_colmap_points(folder: Path) -> Array:
+    """The points [M, 3] of the model in ``folder``, in its own frame; none where it has no file of them.
+
+    Raises:
+        InputError: the file is broken.
+    """
+    binary, text = folder / "points3D.bin", folder / "points3D.txt"
+    if binary.is_file():
+        with _sentence(binary):
+            return _binary_points(binary.read_bytes())
+    if text.is_file():
+        with _sentence(text):
+            lines = [line for line in text.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+            return np.array([[float(v) for v in line.split()[1:4]] for line in lines if line.strip()]).reshape(-1, 3)
+    return np.zeros((0, 3))
+
+
+def _binary_points(data: bytes) -> Array:
+    """Number, place, colour, error and track (image, observation) of each point, one after the other."""
+    places, at = [], 8
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        places.append(struct.unpack_from("<3d", data, at + 8))
+        at += 51 + 8 * struct.unpack_from("<Q", data, at + 43)[0]
+    return np.array(places).reshape(-1, 3)
+
+
 @contextmanager
 def _sentence(path: Path) -> Iterator[None]:
     try:

@@ -10,6 +10,7 @@ from overfly.errors import InputError
 from overfly.flights.exif import Facts, read_facts
 from overfly.flights.flight import Flight, Frame
 from overfly.flights.images import defect, list_images, natural_key
+from overfly.flights.locate import located
 from overfly.flights.odm import read_gcps, read_geo
 from overfly.flights.remarks import altitude_remarks, listed, metadata_remarks
 from overfly.flights.transforms import Cameras, read_transforms
@@ -29,7 +30,8 @@ def read_flight(root: Path | str) -> Flight:
 
     Returns:
         The frames ordered by EXIF time if all have one, else by natural name order; cameras from the first of
-        transforms.json, sparse/ and reconstruction.json.
+        transforms.json, sparse/ and reconstruction.json; those of a model without an origin are brought to the images'
+        GPS, or levelled (:func:`overfly.flights.locate.located`).
 
     Raises:
         InputError: no such folder, fewer than two usable images, broken camera or side files.
@@ -63,7 +65,7 @@ def read_flight(root: Path | str) -> Flight:
         frames = _with_cameras(frames, folder, root, cameras, set(skipped), warnings)
     gcp_file = root / "gcp_list.txt"
     references = [root / f"reference{end}" for end in (".ply", ".las", ".laz")]
-    return Flight(
+    flight = Flight(
         root=root,
         frames=frames,
         origin=cameras.origin if cameras is not None else None,
@@ -74,6 +76,7 @@ def read_flight(root: Path | str) -> Flight:
         reference=next((r for r in references if r.is_file()), None),
         gcps=read_gcps(gcp_file) if gcp_file.is_file() else [],
     )
+    return located(flight)
 
 
 def _read_cameras(root: Path) -> Cameras | None:

@@ -10,7 +10,9 @@ import numpy as np
 
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
-from overfly.geodesy import Origin, enu_from_geodetic
+from overfly.flights.georeference import by_ground
+from overfly.flights.locate import gps_frame
+from overfly.geodesy import Origin
 from overfly.geometry import Array, Camera
 from overfly.mapping.adjustment import Adjusted
 from overfly.mapping.block import Block
@@ -20,7 +22,6 @@ from overfly.mapping.control import control_origin, control_places
 from overfly.mapping.controlled import Controlled, controlled, placed_by_controls
 from overfly.mapping.database import focal_px, strongest_pair
 from overfly.mapping.depth_ranges import beside_others
-from overfly.mapping.georeference import by_ground
 from overfly.mapping.matches import Bar, matched
 from overfly.mapping.placing import UNKNOWN_M, placed, some_of
 from overfly.mapping.sparse import sparse_parts
@@ -108,23 +109,6 @@ def align(
             block = _held_block(flight, parts, origin, told, control, warnings, seed)
         update(2, 2)
     return block
-
-
-def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
-    """The local frame of a flight's GPS and the positions in it [n, 3], NaN where unknown; None without GPS."""
-    fixes = [frame.gps for frame in flight.frames]
-    known = [fix for fix in fixes if fix is not None]
-    if len(known) < 2:
-        return None, None
-    origin = flight.origin or flight.gps_origin()
-    assert origin is not None
-    told = np.full((len(fixes), 3), np.nan)
-    for i, fix in enumerate(fixes):
-        if fix is not None:
-            height = origin.height if fix.altitude is None else fix.altitude
-            told[i] = enu_from_geodetic([[fix.latitude, fix.longitude, height]], origin)[0]
-            told[i, 2] = np.nan if fix.altitude is None else told[i, 2]
-    return origin, told
 
 
 def _held_block(

@@ -112,24 +112,6 @@ class Block:
         }
 
 
-def given_block(flight: Flight) -> Block:
-    """The cameras that the flight folder holds.
-
-    Raises:
-        InputError: it holds none, or for fewer than two frames.
-    """
-    if flight.cameras_from is None:
-        raise InputError(
-            f"{flight.root} holds no cameras (transforms.json, sparse/0 or reconstruction.json): "
-            "map it with --cameras estimate."
-        )
-    frames = [f for f in flight.frames if f.camera is not None and f.world_from_camera is not None]
-    # A COLMAP model without an origin has a scale of its own; transforms.json is in metres by definition.
-    metric = flight.origin is not None or flight.cameras_from == "transforms.json"
-    metric = metric and flight.facts.get("scale") != "unknown"  # as our own transforms.json says of such blocks
-    return checked(Block(frames, flight.origin, flight.cameras_from, metric), flight)
-
-
 def checked(block: Block, flight: Flight) -> Block:
     """The block, if a map can be made from it."""
     if len(block.frames) < 2:

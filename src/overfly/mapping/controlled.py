@@ -119,8 +119,7 @@ def controlled(
     places = np.array([controls[i].place for i in held])
     final, sigma = _weighed(result, views, places, sizes, with_gps=with_gps)
     roles = {i: "check" if apart else "control" for i, apart in zip(usable, check, strict=True)}
-    quiet: list[str] = []
-    points = [_residual(final.bundle, control, roles.get(i), sizes, quiet) for i, control in enumerate(controls)]
+    points = [residual_of(final.bundle, control, roles.get(i), sizes) for i, control in enumerate(controls)]
     shift = final.datum if with_gps else None
     east, north, up = (0.0, 0.0, 0.0) if shift is None else (float(v) for v in shift)
     if shift is not None and abs(up) > 5:
@@ -212,11 +211,9 @@ def _with_knowledge(
     )
 
 
-def _residual(
-    bundle: Bundle, control: Control, role: str | None, sizes: Sequence[tuple[int, int]], quiet: list[str]
-) -> SurveyedPoint:
+def residual_of(bundle: Bundle, control: Control, role: str | None, sizes: Sequence[tuple[int, int]]) -> SurveyedPoint:
     """How far the block sees a point from where it was surveyed: from its clicks alone, controls like checks."""
-    view = see(bundle, control, sizes, quiet)
+    view = see(bundle, control, sizes, [])
     if view is None:
         return _unused(control)
     x, y, z = (round(float(v), 4) for v in view.point - control.place)

@@ -10,6 +10,7 @@ from overfly.errors import InputError
 from overfly.flights import Flight
 from overfly.geodesy import crs_from_enu, vertical_crs
 from overfly.mapping.block import Block
+from overfly.mapping.control import FEWEST
 
 
 def check_place(flight: Flight, asked: str | None, *, estimate: bool, control: str) -> None:
@@ -26,10 +27,13 @@ def check_place(flight: Flight, asked: str | None, *, estimate: bool, control: s
     """
     if asked is None or (not estimate and (flight.cameras_from is None or flight.origin is not None)):
         return
+    if not estimate and control != "none" and len(flight.gcps) >= FEWEST:
+        return
     if not estimate:
         raise InputError(
             f"--heights {asked} needs a place on the Earth, which the cameras of {flight.cameras_from} do not tell: "
-            "give the origin in transforms.json (key overfly.origin), map with --cameras estimate, or leave it out."
+            "give ground control, or the origin in transforms.json (key overfly.origin), map with --cameras estimate, "
+            "or leave it out."
         )
     if sum(frame.gps is not None for frame in flight.frames) < 2 and (not flight.gcps or control == "none"):
         raise InputError(

@@ -15,10 +15,11 @@ from overfly import __version__
 from overfly.errors import InputError
 from overfly.flights import Flight, read_calibration, read_flight, with_calibration
 from overfly.geodesy import crs_code
-from overfly.mapping.block import Block, checked, given_block, read_block, write_block
+from overfly.mapping.block import Block, checked, read_block, write_block
 from overfly.mapping.calibration import source_remarks
 from overfly.mapping.deliver import deliver
 from overfly.mapping.dense import how_dense, memory_budget, stereo_cloud, sweep_cloud
+from overfly.mapping.given import given_block
 from overfly.mapping.heights import check_heights, check_place, with_heights
 from overfly.mapping.needs import SIZE, Sizes, least_gb
 from overfly.mapping.report import count_text
@@ -26,7 +27,7 @@ from overfly.mapping.settings import MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles
 
-BLOCK_FORM, DENSE_FORM = 20, 21
+BLOCK_FORM, DENSE_FORM = 21, 21
 """Of what the steps keep, half-finished parts included: raised whenever the same images and settings become another
 block, or the same block another cloud, so that a map resumed from an older version's folder mixes nothing."""
 
@@ -119,11 +120,13 @@ def _aligned(flight: Flight, identity: str, asked: MapSettings, steps: Steps) ->
         steps.say("lens", f"kept from {asked.calibration}: {_focal_text(flight)}")
     lenses = sorted({repr(f.calibration) for f in flight.frames if f.calibration is not None})
     matched = [asked.seed, *ruled, *asked.matcher_key(), *lenses]
-    key = key_of(__version__, BLOCK_FORM, identity, estimate, matched if estimate else None)
+    key = key_of(__version__, BLOCK_FORM, identity, estimate, matched if estimate else (ruled or None))
     block = steps.kept(
         "cameras",
         key,
-        lambda scratch: estimated_block(flight, scratch, asked, steps) if estimate else given_block(flight),
+        lambda scratch: (
+            estimated_block(flight, scratch, asked, steps) if estimate else given_block(flight, asked.control)
+        ),
         write_block,
         lambda folder: read_block(folder, flight),
     )
@@ -211,4 +214,5 @@ def _focal_text(flight: Flight) -> str:
 
 def _camera_files(root: Path) -> list[tuple[str, int, int]]:
     names = ("transforms.json", "reconstruction.json", "geo.txt", "gcp_list.txt")
-    return fingerprint([root / n for n in names] + list((root / "sparse" / "0").glob("*")))
+    models = [path for folder in ("sparse", "sparse/0") for path in (root / folder).glob("*") if path.is_file()]
+    return fingerprint([root / n for n in names] + models)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from overfly.errors import InputError
 from overfly.flights import Frame
+from overfly.flights.georeference import by_gps, level_line, on_a_line
 from overfly.geometry import Array, rotation_from_gimbal
 from overfly.mapping.bundle import Bundle, merged
-from overfly.mapping.georeference import by_gps, level_line, on_a_line
 
 GPS_SIGMA_M = (0.5, 0.5)
 """Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from overfly.errors import InputError
-from overfly.geometry import Array, fit_similarity, rotation_from_gimbal, transform
+from overfly.geometry import Array, fit_similarity, pose, rotation_from_gimbal, transform
 
 COLLINEAR = 0.08
 """Below this ratio of the horizontal spreads, positions lie on a line and do not say which way is up."""
@@ -43,9 +43,9 @@ def by_gps(positions: Array, told: Array, gimbals: list[tuple[float, float, floa
         if not _leans(matrix, gimbals, rotations):
             return matrix  # else some heights are so wrong that they tilt the block
     level = np.eye(4)
-    level[:3, :3] = _upright(gimbals, rotations)
-    upright = transform(level, positions)
-    flat_from = np.column_stack([upright[known, :2], np.zeros(known.sum())])
+    level[:3, :3] = upright(gimbals, rotations)
+    levelled = transform(level, positions)
+    flat_from = np.column_stack([levelled[known, :2], np.zeros(known.sum())])
     flat_to = np.column_stack([told[known, :2], np.zeros(known.sum())])
     matrix = _robust(flat_from, flat_to) @ level
     heights = told[:, 2] - transform(matrix, positions)[:, 2]
@@ -130,7 +130,7 @@ def _fit_flat(source: Array, target: Array, weights: Array) -> Array:
     return matrix
 
 
-def _upright(gimbals: list[tuple[float, float, float] | None], rotations: Array) -> Array:
+def upright(gimbals: list[tuple[float, float, float] | None], rotations: Array) -> Array:
     """The rotation [3, 3] that turns the reconstruction's up to +z."""
     return _to_z(_up(gimbals, rotations))
 
@@ -151,6 +151,12 @@ def _to_z(up: Array) -> Array:
     x = np.cross(axis, up)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(up, x), up])
+
+
+def moved_poses(matrix: Array, poses: Array) -> Array:
+    """Poses [n, 4, 4] in the frame that a similarity [4, 4] leads to."""
+    turn = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3]))
+    return np.stack([pose(turn @ old[:3, :3], transform(matrix, old[:3, 3])) for old in poses])
 
 
 def by_ground(positions: Array, points: Array, rotations: Array, seed: int) -> Array:

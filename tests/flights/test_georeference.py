@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from overfly.errors import InputError
+from overfly.flights.georeference import by_gps, by_ground, on_a_line
 from overfly.geometry import rotation_from_gimbal, transform
-from overfly.mapping.georeference import by_gps, by_ground, on_a_line
 
 GIMBALS = [(20.0 * i, -80.0 + i, 0.0) for i in range(8)]
 ROTATIONS = np.stack([rotation_from_gimbal(*g) for g in GIMBALS])
