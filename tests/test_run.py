@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import torch
 
 from overfly.errors import InputError
 from overfly.run import load_run, main
+from overfly.shipped import export
 from overfly.tables import read_rows
 
 pytestmark = [
@@ -172,6 +174,55 @@ def test_resuming_a_finished_run_of_all_phases_computes_nothing_again(train, fin
     assert times == {path: path.stat().st_mtime_ns for path in finished.glob("*/checkpoints/best.ckpt")}
 
 
+def test_a_finished_run_of_all_phases_is_trained_on_with_more_epochs(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    run, phases = tmp_path / "run", ("encoder", "gan", "full")
+    train("experiment=smoke", "trainer.max_epochs=1", "test=false", f"hydra.run.dir={run}")
+    before = {phase: read_rows(run / phase / "metrics.csv") for phase in phases}
+    train(f"resume={run}", "trainer.max_epochs=2")
+    for phase in phases:
+        now = read_rows(run / phase / "metrics.csv")
+        assert now[:1] == before[phase]
+        assert [row["epoch"] for row in now] == [0, 1]
+
+
+def test_going_on_with_another_stage_or_in_a_phase_touches_nothing(train, finished: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    run = tmp_path / "run"
+    shutil.copytree(finished, run)
+    kinds = ("*.yaml", "*.txt", "*.json", "*.ckpt")
+    before = {path: path.read_bytes() for kind in kinds for path in run.rglob(kind)}
+    phase = train(f"resume={run / 'full'}", "trainer.max_epochs=3", code=2)
+    assert f"is a phase of a run of stage=all: give resume={run}" in phase.stderr
+    other = train(f"resume={run}", "stage=gan", code=2)
+    assert "is a run of stage=all, not of stage=gan: leave stage out" in other.stderr
+    wrong = train(f"resume={run}", "trainer.max_epochs=4", "data.source.camera=mavic9", code=2)
+    assert "mavic9" in wrong.stderr
+    network = train(f"resume={run}", "trainer.max_epochs=4", "model=local_decoder", code=2)
+    assert "holds the weights of another network" in network.stderr
+    for path, content in before.items():
+        assert path.read_bytes() == content, path
+    train(f"resume={run}")
+
+
+def test_weights_that_are_asked_for_and_not_there_are_missed(train, finished: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "empty").mkdir()
+    for stage in ("gan", "full"):
+        result = train("experiment=smoke", f"stage={stage}", "from_run=empty", code=2)
+        assert "from_run=empty holds no checkpoints/best.ckpt and no exported weights" in result.stderr
+    export(finished, tmp_path / "exported", "mine")
+    result = train("experiment=smoke", "stage=gan", "from_run=exported", "trainer.fast_dev_run=true")
+    assert "from exported/mine.safetensors" in result.stdout + result.stderr
+
+
+def test_parts_of_ones_own_are_found_in_the_working_folder(train, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """As the example of docs/networks.md."""
+    text = (ROOT / "docs" / "networks.md").read_text()
+    (code,) = re.findall(r"```python\n# mine.py\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "mine.py").write_text(code)
+    (command,) = re.findall(r"python train.py (stage=gan stage._target_=mine.*)\n", text)
+    train("experiment=smoke", *command.split(), "trainer.max_epochs=1", "hydra.run.dir=run")
+    assert read_rows(tmp_path / "run" / "metrics.csv")[0]["train/loss_smooth"] > 0
+
+
 def test_an_evaluation_is_one_table_and_one_picture_and_goes_on_where_it_was_stopped(  # type: ignore[no-untyped-def]
     train, finished: Path, tmp_path: Path
 ) -> None:
@@ -191,6 +242,9 @@ def test_an_evaluation_is_one_table_and_one_picture_and_goes_on_where_it_was_sto
     assert "9 of 12 windows were measured before" in (run / "train.log").read_text() + result.stderr
     assert (run / "evaluation.csv").read_text() == table
     assert len([json.loads(line) for line in (run / "windows.jsonl").read_text().splitlines()]) == 12
+    for change in ("seed=99", f"from_run={finished / 'encoder'}"):
+        other = train(f"resume={run.relative_to(tmp_path)}", change, code=2)
+        assert "was measured with other values of" in other.stderr
     refused = train(*small, f"from_run={finished}", f"networks={{gan decoder: {finished}}}", code=2)
     assert "choose another name" in refused.stderr
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from overfly.evaluation import Baselines, Network, evaluate
 from overfly.evaluation.cameras import ESTIMATED, estimate_all
 from overfly.evaluation.evaluate import KEPT
 from overfly.run import Run
+from overfly.run_folder import write_json
 from overfly.shipped import load_network
 
 log = logging.getLogger("overfly")
@@ -64,6 +68,7 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
         data.datasets[split] = data.dataset(split)
         data.datasets[split].twice = True
         data.datasets[split].windows = data.datasets[split].windows[:: cfg.every]
+    _same_question(cfg, networks, run_dir)
     if not cfg.resume:
         (run_dir / KEPT).unlink(missing_ok=True)
         shutil.rmtree(run_dir / ESTIMATED, ignore_errors=True)
@@ -93,6 +98,43 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     )
     log.info("The table is %s, the picture %s", run_dir / "evaluation.md", run_dir / "evaluation.png")
     return next(float(row["chamfer_m2"]) for row in rows if row["cloud"] == own)
+
+
+QUESTION = "question.json"
+"""What an evaluation measures and of which weights, so that a resumed one does not mix two."""
+
+NO_MATTER = ("workers", "batch_size")
+"""Keys of the data that change no number."""
+
+
+def _same_question(cfg: DictConfig, networks: Mapping[str, Network], run_dir: Path) -> None:
+    """Keep what is asked; refuse to go on with windows that were measured with other data, settings or weights."""
+    data = OmegaConf.to_container(cfg.data, resolve=True)
+    assert isinstance(data, dict)
+    question: dict[str, Any] = {str(key): value for key, value in data.items() if key not in NO_MATTER}
+    question |= {key: cfg[key] for key in ("every", "emd_windows", "draws", "points", "seed", "cameras")}
+    asked = {key: _digest(json.dumps(value, sort_keys=True).encode()) for key, value in question.items()}
+    for name, network in networks.items():
+        weights = [
+            tensor.detach().cpu().numpy().tobytes() for _, tensor in sorted(network.network.state_dict().items())
+        ]
+        asked[f"the weights of {name}"] = _digest(*weights)
+    path = run_dir / QUESTION
+    if cfg.resume and path.is_file():
+        before = json.loads(path.read_text())
+        if other := sorted(key for key in before.keys() | asked.keys() if before.get(key) != asked.get(key)):
+            raise InputError(
+                f"{run_dir} was measured with other values of {', '.join(other)}: resume it without other overrides, "
+                "or evaluate into a new folder."
+            )
+    write_json(path, asked)
+
+
+def _digest(*parts: bytes) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return digest.hexdigest()[:16]
 
 
 def _name(run: Run) -> str:

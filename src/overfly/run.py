@@ -14,6 +14,7 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -22,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from overfly.configuration import build, check, conf_dir, explain, register_resolvers, save
 from overfly.errors import InputError
-from overfly.run_folder import checkpoint, collect, read_weights, resumed, write_json
+from overfly.run_folder import as_it_was, checkpoint, collect, read_weights, resumed, same_stage, write_json
 
 if TYPE_CHECKING:
     import torch
@@ -35,21 +36,27 @@ def train(cfg: DictConfig) -> float | None:
     check(cfg)
     _check_processes(cfg)
     run_dir = Path(cfg.run_dir)
-    _open_folder(cfg, run_dir)
-    log.info("The run folder is %s", run_dir)
-    if cfg.stage_name == "evaluate":
-        from overfly.evaluate import evaluate_run
+    if cfg.resume:
+        same_stage(run_dir, cfg.stage_name)
+    with as_it_was(run_dir) if cfg.resume and _leads() else nullcontext():
+        _open_folder(cfg, run_dir)
+        log.info("The run folder is %s", run_dir)
+        if cfg.stage_name == "evaluate":
+            from overfly.evaluate import evaluate_run
 
-        _quieten()
-        return evaluate_run(cfg, run_dir)
-    if cfg.stage_name != "all":
-        return _train_stage(cfg)
+            _quieten()
+            return evaluate_run(cfg, run_dir)
+        return _train_stage(cfg) if cfg.stage_name != "all" else _train_phases(cfg, run_dir)
+
+
+def _train_phases(cfg: DictConfig, run_dir: Path) -> float | None:
+    """The phases one after the other, each from the weights of the one before it."""
     value, before = None, cfg.from_run
     for name, phase in cfg.phases.items():
         part = OmegaConf.merge(cfg, phase, {"run_dir": str(run_dir / name), "from_run": before})
         assert isinstance(part, DictConfig)
         done = run_dir / name / "metrics.json"
-        if cfg.resume and done.is_file():
+        if cfg.resume and done.is_file() and not _goes_on(run_dir / name, part):
             log.info("%s: finished before, its results in %s are kept", name, done.parent)
             value = json.loads(done.read_text()).get("monitored")
         else:
@@ -59,6 +66,13 @@ def train(cfg: DictConfig) -> float | None:
         if _leads():
             collect(run_dir, list(cfg.phases))
     return value
+
+
+def _goes_on(folder: Path, part: DictConfig) -> bool:
+    """Whether a finished phase is asked for more epochs than it was made with."""
+    made = OmegaConf.load(folder / "config.yaml")
+    assert isinstance(made, DictConfig)
+    return bool(part.trainer.max_epochs > made.trainer.max_epochs)
 
 
 def _open_folder(cfg: DictConfig, run_dir: Path) -> None:
@@ -101,7 +115,7 @@ def _train_stage(cfg: DictConfig) -> float | None:
     cfg = OmegaConf.merge(cfg, {"stage": {"epochs": cfg.trainer.max_epochs}})  # type: ignore[assignment]
     L.seed_everything(cfg.seed, workers=True, verbose=False)
     stage = build(cfg.stage)
-    for line in warm_start(stage, cfg.stage_name, cfg.from_run):
+    for line in warm_start(stage, cfg.stage_name, cfg.from_run, tried=bool(cfg.trainer.fast_dev_run)):
         log.info(line)
     loggers = list(build(cfg.logger).values())
     try:
@@ -115,6 +129,13 @@ def _train_stage(cfg: DictConfig) -> float | None:
         resume_from = str(last) if cfg.resume and last.is_file() else None
         try:
             trainer.fit(stage, datamodule=data, ckpt_path=resume_from, weights_only=True)
+        except RuntimeError as error:
+            if resume_from is None or "state_dict" not in str(error):
+                raise
+            raise InputError(
+                f"{last} holds the weights of another network than {cfg.model._target_} as it is asked for now: resume "
+                "without other overrides for model, or start a new run."
+            ) from error
         except SystemExit as stop:  # so Lightning answers Ctrl+C
             if trainer.interrupted:
                 raise KeyboardInterrupt from stop
@@ -185,8 +206,13 @@ def _best(trainer: Any, monitor: str, metrics: dict[str, float]) -> tuple[str | 
     return callback.best_model_path, float(callback.best_model_score)
 
 
-def warm_start(stage: Any, name: str, from_run: str | None) -> list[str]:
-    """Start ``stage`` from another run's weights; one line for every part says where its weights came from."""
+def warm_start(stage: Any, name: str, from_run: str | None, *, tried: bool = False) -> list[str]:
+    """Start ``stage`` from another run's weights; one line for every part says where its weights came from.
+
+    Raises:
+        InputError: ``from_run`` holds no weights; if all is only ``tried`` (fast_dev_run, which saves none) it may be a
+            run without.
+    """
     if name == "ssgan3d":
         start = ["ssgan3d: the mesh starts as the rough one, the critic at random (seeded)"]
         return start if from_run is None else cast(list[str], stage.warm_start({}, from_run))
@@ -194,9 +220,12 @@ def warm_start(stage: Any, name: str, from_run: str | None) -> list[str]:
         more = "" if name == "encoder" else f"; from_run=outputs/encoder/... starts {name} from a trained encoder"
         return [f"{name}: every weight starts at random (seeded){more}"]
     path = checkpoint(Path(from_run))
-    if path is None and name == "encoder":
-        raise InputError(f"from_run={from_run} holds no checkpoints/best.ckpt: give the folder of a finished run.")
-    if path is None:  # a phase under fast_dev_run leaves no checkpoint
+    if path is None and (name == "encoder" or not tried or not (Path(from_run) / "config.yaml").is_file()):
+        raise InputError(
+            f"from_run={from_run} holds no checkpoints/best.ckpt and no exported weights: give the folder of a "
+            "finished run, or what overfly export wrote."
+        )
+    if path is None:
         return [f"{name}: {from_run} saved no checkpoint, so every weight starts at random (seeded)"]
     lines: list[str] = stage.warm_start(read_weights(path), str(path))
     return lines
@@ -253,6 +282,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.argv = started  # the command by which Lightning starts the other processes of trainer=ddp
         return train(cfg)
 
+    sys.path.append(os.getcwd())  # parts of one's own, by their _target_
     try:
         sys.argv = ["train.py", *resumed(sys.argv[1:] if argv is None else argv)]
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="train")(job)()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,8 @@ WEIGHTS = Path(__file__).parent / "weights"
 
 
 def checkpoint(folder: Path) -> Path | None:
-    """The best checkpoint of a run folder, or the weights of a shipped network by its name; None if there are none.
+    """The best checkpoint of a run folder, exported weights, or those of a shipped network by its name; None if there
+    are none.
 
     Raises:
         InputError: there is neither such a folder nor such a network.
@@ -36,7 +38,8 @@ def checkpoint(folder: Path) -> Path | None:
     for part in (folder, folder / "full", folder / "gan", folder / "encoder"):
         if (part / "checkpoints" / "best.ckpt").is_file():
             return part / "checkpoints" / "best.ckpt"
-    return None
+    exported = list(folder.glob("*.safetensors"))
+    return exported[0] if len(exported) == 1 else None
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
@@ -84,6 +87,51 @@ def collect(run_dir: Path, phases: list[str]) -> None:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n")
+
+
+PHASES = ("encoder", "gan", "full")
+"""Of ``stage=all``: each has a run folder of its own in that of the whole."""
+
+SAID = ("config.yaml", "overrides.txt")
+"""Files of a run folder that say what was asked."""
+
+
+def same_stage(folder: Path, stage: str) -> None:
+    """Refuse to go on in a run folder with another stage, which would overwrite its results.
+
+    Raises:
+        InputError: it is of another stage, or a phase of a run of ``stage=all``.
+    """
+    from omegaconf import OmegaConf
+
+    if not (folder / "config.yaml").is_file():
+        return
+    whole = any((folder / name / "config.yaml").is_file() for name in PHASES)
+    made = "all" if whole else str(OmegaConf.load(folder / "config.yaml").stage_name)
+    if made == stage:
+        return
+    if folder.name in PHASES and (folder.parent / "overrides.txt").is_file():
+        raise InputError(
+            f"resume={folder} is a phase of a run of stage=all: give resume={folder.parent}, or start a run of its own "
+            f"from its weights with stage={made} from_run={folder}."
+        )
+    raise InputError(
+        f"resume={folder} is a run of stage={made}, not of stage={stage}: leave stage out to go on with it, or start a "
+        f"new run from its weights with from_run={folder}."
+    )
+
+
+@contextmanager
+def as_it_was(folder: Path) -> Iterator[None]:
+    """If going on fails, a run folder and its phases keep what they said: a bad override must not stay in them."""
+    files = [top / name for top in (folder, *(folder / phase for phase in PHASES)) for name in SAID]
+    before = {path: path.read_bytes() for path in files if path.is_file()}
+    try:
+        yield
+    except Exception:
+        for path, content in before.items():
+            path.write_bytes(content)
+        raise
 
 
 def resumed(argv: Sequence[str]) -> list[str]:

@@ -85,7 +85,10 @@ def test_other_heights_reuse_the_steps_and_leave_nothing_of_the_ones_before(geoi
 
 @pytest.mark.parametrize(
     ("cameras", "advice"),
-    [("given", "cameras of transforms.json do not tell: give ground control"), ("estimate", "does not tell: give GPS in")],
+    [
+        ("given", "cameras of transforms.json do not tell: give ground control"),
+        ("estimate", "does not tell: give GPS in"),
+    ],
 )
 def test_a_flight_without_a_place_on_the_earth_has_no_such_heights(  # type: ignore[no-untyped-def]
     geoid, cameras: str, advice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

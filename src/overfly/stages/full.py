@@ -31,7 +31,7 @@ class FullStage(GanStage):
         super().__init__(freeze_encoder=False, **others)
         self.pixels = pixels
 
-    def _more_terms(self, output: dict[str, Any], batch: Batch, random: torch.Generator) -> dict[str, Tensor]:
-        terms = super()._more_terms(output, batch, random)
+    def more_terms(self, output: dict[str, Any], batch: Batch, random: torch.Generator) -> dict[str, Tensor]:
+        terms = super().more_terms(output, batch, random)
         encoded = output if "match_map" in output else self.network.encode(batch)  # type: ignore[operator]
         return {**terms, **encoder_terms(encoded, batch, self.weights, pixels=self.pixels, random=random)}

@@ -105,7 +105,7 @@ class GanStage(Stage):
         if self._adversarial():
             judged = self._discriminator_step(players[1], cloud.detach(), real, batch_idx, random)
         with self.toggled_optimizer(players[0]):
-            terms = {**self._cloud_terms(cloud, real, random), **self._more_terms(output, batch, random)}
+            terms = {**self._cloud_terms(cloud, real, random), **self.more_terms(output, batch, random)}
             loss = self.total(terms)
             parts = ["generator"] if self.frozen else ["encoder", "generator"]
             self.optimise(players[0], loss, batch_idx, parts)
@@ -143,7 +143,7 @@ class GanStage(Stage):
                     terms[name] = getattr(losses, name)(logits)
         return terms
 
-    def _more_terms(self, output: dict[str, Any], batch: Batch, random: torch.Generator) -> dict[str, Tensor]:
+    def more_terms(self, output: dict[str, Any], batch: Batch, random: torch.Generator) -> dict[str, Tensor]:
         if "surfaces" not in output:
             return {}
         return surface_terms(output["surfaces"], batch, self.weights)
@@ -152,7 +152,7 @@ class GanStage(Stage):
         output = self.network(batch)
         cloud, real = output["points"], batch["reference"]
         random = self.random(batch_idx, epoch=0)
-        terms = {**self._cloud_terms(cloud, real, random), **self._more_terms(output, batch, random)}
+        terms = {**self._cloud_terms(cloud, real, random), **self.more_terms(output, batch, random)}
         self._report_losses(split, self.total(terms), terms, len(real))
         self._report_clouds(split, cloud, batch)
         self._report_surfaces(split, output, batch)

@@ -67,8 +67,8 @@ class Stage(L.LightningModule):
     ) -> None:
         super().__init__()
         for name in loss:
-            if name not in TERMS:
-                raise unknown("The loss term", name, TERMS)
+            if name not in TERMS and name not in self.terms:  # a stage of one's own may have terms of its own
+                raise unknown("The loss term", name, (*TERMS, *(term for term in self.terms if term not in TERMS)))
         self.weights = {name: float(loss[name]) for name in self.terms if loss.get(name)}
         if not self.weights:
             raise InputError(
