@@ -21,13 +21,28 @@ def test_a_slope_measured_around_a_gap_is_carried_into_it() -> None:
     true, houses = landscape()
     measured = true.copy()
     measured[30:60, 40:80] = np.nan
-    found, _ = anchored(houses, measured)
+    found = anchored(houses - 100, measured - 100)[0] + 100
     gap = np.isnan(measured)
     assert np.abs(houses - true)[gap].mean() > 2.0
     assert np.abs(found - true)[gap].mean() < 0.6
     rises = (found - (true - houses))[gap]
     assert rises[houses[gap] > 0].min() > 3.0  # houses still stand there
     assert np.abs(rises[houses[gap] == 0]).max() < 1.5
+
+
+@pytest.mark.parametrize("seeming", [2.5, 6.0, 14.0])
+def test_what_stands_in_a_gap_is_as_high_as_what_looks_like_it_where_it_is_measured(seeming: float) -> None:
+    """However the network mistakes the height of houses, it mistakes them alike."""
+    true, houses = landscape()
+    measured = true - 100
+    measured[30:60, 40:80] = np.nan
+    gap = np.isnan(measured)
+    found, sure = anchored(houses * seeming / 6 - 100, measured)
+    roofs = found[gap & (houses > 0)] - (true - 100)[gap & (houses > 0)]
+    assert np.median(np.abs(roofs)) < 1.0
+    rough = measured + 5 * np.random.default_rng(0).standard_normal(houses.shape).astype(np.float32) * (houses > 0)
+    unsure = anchored(houses * seeming / 6 - 100, rough)[1]
+    assert (unsure < sure)[gap & (houses > 0)].mean() > 0.95
 
 
 def test_the_height_of_the_ground_is_not_the_suggestion_s_to_tell() -> None:

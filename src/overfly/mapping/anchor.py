@@ -2,8 +2,8 @@
 
 A network that sees a place once knows what stands on the ground, roughly, and not how high the ground is: where it was
 followed, even with its mean error taken off, plain interpolation between the measured places was nearer to the truth.
-So the measured surface is carried on smoothly, and only what rises clearly over its surroundings is taken from the
-network, shrunk, since it is wrong as often as right.
+So the measured surface is carried on smoothly, and of the network only the order is taken: how much rises over it what
+looks as tall is seen where the same image is measured.
 """
 
 from __future__ import annotations
@@ -32,11 +32,15 @@ ABOVE = 4.0
 """How much more a cell over the plate is taken to miss it than one under it: what stands on the ground is over it. The
 price: wrong cells below the ground pull it down; 15 % of them, 15 m too low, by 2.6 m."""
 
-TALL = 0.05
-"""Share of the camera's height over the surface by which something must rise over its surroundings to be believed."""
+TALL = (0.003, 0.007, 0.013, 0.02, 0.03, 0.04, 0.05, 0.067, 0.1)
+"""Shares of the camera's height over the surface between which things look as tall as one another."""
 
-SHRUNK = 0.7
-"""Part of its height that it gets: what is wrong half of the time is best told lower than it seems."""
+FEWEST_SEEN = 100
+"""Measured pixels that look so tall, or what is measured tells nothing of such a height."""
+
+BELIEVED, SHRUNK, HALF = 0.05, 0.7, 0.5
+"""Where it tells nothing: the share of the camera's height that something must seem to rise to be believed, the part of
+its height that it gets, and how much of it is taken to be right."""
 
 SURROUNDINGS = 4
 """Cells across which what stands on the ground is told from the ground."""
@@ -47,11 +51,11 @@ RIGHT = 0.01
 AROUND = 4.0
 """Cells, standard deviation of the weights by which measured pixels around a place tell how level the land is there."""
 
-BELIEF = (-0.83, -0.88, 3.16, -2.31)
+BELIEF = (-2.46, -0.55, 1.91, 3.13)
 """Logit of the probability that a height is right: constant; times the logarithm of 1 + cells to the nearest measured
-one; times the share of measured pixels around that are right on the plate; where something rises. Fitted by maximum
-likelihood to 130 images of seven rendered flights: of what it gives up to 20, 40, 60, 80 and 100 %, there 13, 31, 50,
-73 and 93 % are right. What the network thinks of its own word told nothing, or the reverse."""
+one; times the share of measured pixels around that are right on the plate; times that of those that look as tall and
+rise as much. Fitted by maximum likelihood to frames of ten rendered flights over four styles. What the network thinks
+of its own word told nothing, or the reverse."""
 
 
 def anchored(suggested: Map, measured: Map) -> tuple[Map, Map]:
@@ -63,8 +67,9 @@ def anchored(suggested: Map, measured: Map) -> tuple[Map, Map]:
 
     Returns:
         heights [h, w]: a thin plate through the medians of the measured cells (Duchon 1977), and on it what the
-        suggestion lets rise over its surroundings; and the probability [h, w] that they are right where nothing is
-        measured. Where too little is measured the suggestion itself, as sure as what is far from everything.
+        suggestion lets rise over its surroundings, as high as what seems as tall is where it is measured; and the
+        probability [h, w] that they are right where nothing is measured. Where too little is measured the suggestion
+        itself, as sure as what is far from everything.
     """
     import cv2
     from scipy.ndimage import distance_transform_edt
@@ -73,24 +78,47 @@ def anchored(suggested: Map, measured: Map) -> tuple[Map, Map]:
     size = max(1, round(max(h, w) / CELLS))
     medians, weights = _cells(measured, size)
     if not weights.any():
-        nothing = BELIEF[0] + BELIEF[1] * np.log1p(CELLS)
+        nothing = BELIEF[0] + BELIEF[1] * np.log1p(CELLS) + BELIEF[3] * HALF
         return suggested, np.full_like(suggested, 1 / (1 + np.exp(-nothing)))
     rows, columns = medians.shape
     plate = _plate(medians, weights).astype(np.float32)
     surface = cv2.resize(plate, (columns * size, rows * size), interpolation=cv2.INTER_CUBIC)[:h, :w]
     kernel = np.ones((SURROUNDINGS * size | 1,) * 2, np.uint8)
     ground = cv2.GaussianBlur(cv2.morphologyEx(suggested, cv2.MORPH_OPEN, kernel), (0, 0), size)
-    rise = suggested - ground
-    stands = rise > TALL * np.abs(surface)
-    heights = surface + np.where(stands, SHRUNK * rise, 0)
+    above = np.maximum(np.abs(surface), 1e-3)
+    rise, alike = _as_measured((suggested - ground) / above, (measured - surface) / above)
+    heights = surface + rise * above
     known = np.isfinite(measured).astype(np.float32)
     with np.errstate(invalid="ignore"):
-        level = (np.abs(measured - surface) < RIGHT * np.abs(surface)).astype(np.float32)
+        level = (np.abs(measured - surface) < RIGHT * above).astype(np.float32)
     total, share = (cv2.GaussianBlur(part, (0, 0), AROUND * size) for part in (known, level))
     far = distance_transform_edt(weights == 0).astype(np.float32)
     far = cv2.resize(far, (columns * size, rows * size), interpolation=cv2.INTER_LINEAR)[:h, :w]
-    logit = BELIEF[0] + BELIEF[1] * np.log1p(far) + BELIEF[2] * share / np.maximum(total, 1e-6) + BELIEF[3] * stands
+    logit = BELIEF[0] + BELIEF[1] * np.log1p(far) + BELIEF[2] * share / np.maximum(total, 1e-6) + BELIEF[3] * alike
     return heights.astype(np.float32), (1 / (1 + np.exp(-logit))).astype(np.float32)
+
+
+def _as_measured(seeming: Map, true: Map) -> tuple[Map, Map]:
+    """How much things rise, [h, w], and the share of measured pixels that look as tall and do so, to :data:`RIGHT`.
+
+    Args:
+        seeming: rise over the surroundings as suggested, in shares of the camera's height.
+        true: as measured, NaN where nothing is.
+    """
+    kind = np.searchsorted(TALL, seeming)
+    known = np.isfinite(true)
+    rise = np.where(seeming > BELIEVED, SHRUNK * seeming, 0)
+    alike = np.full(seeming.shape, HALF)
+    kinds, told = kind[known], true[known]
+    for k in range(len(TALL) + 1):
+        found = np.sort(told[kinds == k])
+        if len(found) < FEWEST_SEEN:
+            continue
+        within = np.searchsorted(found, found + 2 * RIGHT, side="right") - np.arange(len(found))
+        first = int(within.argmax())
+        rise[kind == k] = np.median(found[first : first + within[first]])  # of the densest group: roofs are alike
+        alike[kind == k] = within[first] / len(found)
+    return rise.astype(np.float32), alike.astype(np.float32)
 
 
 def _cells(measured: Map, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
