@@ -45,6 +45,20 @@ def test_what_stands_in_a_gap_is_as_high_as_what_looks_like_it_where_it_is_measu
     assert (unsure < sure)[gap & (houses > 0)].mean() > 0.95
 
 
+def test_one_small_object_does_not_tell_how_tall_all_others_are() -> None:
+    flat = np.full((180, 240), -100, np.float32)  # cells of 8 x 8
+    measured = flat.copy()
+    measured[:, 120:] = np.nan
+    suggested = np.zeros_like(flat)
+    suggested[40:56, 8:16] = 8  # it seems 8 m tall, and is a flat one
+    suggested[80:100, 140:160] = 8
+    found = anchored(suggested, measured)[0]
+    assert found[90, 150] > -96
+    suggested[40:56, 8:48] = 8
+    assert anchored(suggested, measured)[0][90, 150] < -99
+    np.testing.assert_array_equal(found[90], anchored(suggested, measured, oblique=True)[0][90])
+
+
 def test_the_height_of_the_ground_is_not_the_suggestion_s_to_tell() -> None:
     """A network that sees a place once tells how high the ground is no better than by chance."""
     true, houses = landscape()

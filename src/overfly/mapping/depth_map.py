@@ -12,6 +12,9 @@ from overfly.files import opened_arrays
 from overfly.geometry import Array, Camera, pixel_grid, rays
 from overfly.mapping.anchor import RIGHT, Map, anchored
 
+OBLIQUE_DEG = 20.0
+"""Tilt from which on an image is oblique."""
+
 ONE_SIGMA = 0.683
 """Share of errors below one standard deviation."""
 
@@ -78,7 +81,8 @@ class Opinion:
         fall = rays(pixel_grid(width, height), camera.resized(width, height)) @ world_from_camera[2, :3]
         fall = np.minimum(fall, -0.1).astype(np.float32)  # metres down per metre of depth
         small = cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST)
-        heights, sure = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32))
+        oblique = world_from_camera[2, 2] > -np.cos(np.deg2rad(OBLIQUE_DEG))
+        heights, sure = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32), oblique)
         # A slope carried on far enough passes the camera.
         depth = np.where(heights < 0, heights / fall, np.float32(np.nan))
         # The standard deviation of a Laplace distribution of which so much is right.
