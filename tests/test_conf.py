@@ -157,11 +157,15 @@ def test_unknown_style_is_named_with_the_nearest() -> None:
         ("data.source.styles=[vilage]", "did you mean 'village'"),
         ("resume=nowhere", "resume=nowhere is not a run folder"),
         ("from_run=nowhere", "no run folder nowhere"),
+        ("stage gan", "'stage' cannot be read: type KEY=VALUE"),
+        ("experiment=paper_table1 altitude=100", "add data.source.cells=null"),
+        ("model._target_=mine.Typo stage=gan", "_target_=mine.Typo was not found"),
+        ("experiment=smoke stage=encoder monitor=val/chamfer trainer.accelerator=cpu", "Allowed: train/accuracy"),
     ],
 )
 def test_what_is_wrong_is_one_sentence_and_exit_code_2(override: str, says: str, tmp_path: Path) -> None:
     result = subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), override, f"output_root={tmp_path}", f"cache_dir={tmp_path}"],
+        [sys.executable, str(ROOT / "train.py"), *override.split(), f"output_root={tmp_path}", f"cache_dir={tmp_path}"],
         capture_output=True,
         text=True,
         cwd=tmp_path,

@@ -25,7 +25,7 @@ ORDER = [
     ["preflight"],
     ["refinement"],
     ["evaluation"],
-    ["configuration", "summary", "run_folder", "run", "evaluate", "shipped", "refine"],
+    ["checks", "keys", "configuration", "summary", "run_folder", "run", "evaluate", "shipped", "refine"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

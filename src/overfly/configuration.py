@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import os
 import re
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from overfly.errors import InputError
-
-BOUNDS = {"altitude": (20, 500), "overlap": (0, 95), "side_overlap": (0, 95)}
-UNITS = {"altitude": "metres above ground", "overlap": "percent", "side_overlap": "percent"}
+from overfly.checks import check_overrides, check_together, check_values
+from overfly.errors import InputError, unknown
+from overfly.keys import no_key, top_keys
 
 
 def conf_dir() -> Path:
@@ -41,53 +39,21 @@ def register_resolvers() -> None:
 
 
 def check(cfg: DictConfig) -> None:
-    """Refuse values that no flight can have.
+    """Refuse what no run can mean.
 
     Raises:
-        InputError: ``altitude``, ``overlap`` or ``side_overlap`` is no number or out of bounds; ``frames`` or
-            ``image_size`` is not possible; a key that no file of the tree knows.
+        InputError: a value is not possible, a key is in no file of the tree, parts do not go together, or an override
+            that was typed would be ignored.
     """
-    for key, (low, high) in BOUNDS.items():
-        values = cfg[key] if OmegaConf.is_list(cfg[key]) else [cfg[key]]
-        for value in values:
-            if value is None and key == "side_overlap":
-                continue
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not number or not (low <= value <= high):
-                raise InputError(
-                    f"{key}={value} is not possible: give {UNITS[key]}, a number from {low} to {high} "
-                    f"(or a list of them), for instance {key}={(low + high) // 2}."
-                )
-    unknown_keys = sorted(set(map(str, cfg)) - _top_keys())
+    from hydra.core.hydra_config import HydraConfig
+
+    unknown_keys = sorted(set(map(str, cfg)) - top_keys(conf_dir()))
     if unknown_keys:
-        raise InputError(_no_key(unknown_keys[0]))
-    size = OmegaConf.to_container(cfg.image_size) if OmegaConf.is_list(cfg.image_size) else cfg.image_size
-    if not (isinstance(size, list) and len(size) == 2 and all(type(x) is int and x > 0 for x in size)):
-        raise InputError(f"image_size={size} is not possible: give width and height in pixels, image_size=[128,96].")
-    if not isinstance(cfg.frames, int) or not 1 <= cfg.frames <= 8:
-        raise InputError(f"frames={cfg.frames} is not possible: a window has 1 to 8 frames, for instance frames=3.")
-
-
-@lru_cache(maxsize=1)
-def _top_keys() -> frozenset[str]:
-    """Every key that may stand at the top: of the primary file, of files that are laid over all, and the groups."""
-    keys = {path.name for path in conf_dir().iterdir() if path.is_dir()}
-    for path in conf_dir().rglob("*.yaml"):
-        if path.parent == conf_dir() or path.read_text().startswith("# @package _global_"):
-            keys |= {str(key) for key in OmegaConf.load(path)}
-    return frozenset(keys - {"defaults"})
-
-
-def _no_key(key: str) -> str:
-    from difflib import get_close_matches
-
-    if key in _top_keys():
-        files = [p for p in conf_dir().glob("*/*.yaml") if re.search(rf"^{key}:", p.read_text(), re.MULTILINE)]
-        groups = " or ".join(sorted(f"{p.parent.name}={p.stem}" for p in files))
-        return f"The key {key!r} belongs to {groups}: add that, or leave {key} out."
-    near = get_close_matches(key, _top_keys(), 1)
-    meant = f" Did you mean {near[0]}?" if near else ""
-    return f"There is no key {key!r}.{meant} Type `python train.py --cfg job` to see every key."
+        raise InputError(no_key(unknown_keys[0], cfg, conf_dir()))
+    check_together(cfg, conf_dir())
+    if HydraConfig.initialized():
+        check_overrides(cfg, HydraConfig.get().overrides.task, conf_dir())
+    check_values(cfg)
 
 
 def build(cfg: Any) -> Any:
@@ -118,7 +84,12 @@ def save(cfg: DictConfig, folder: Path) -> None:
 
 def explain(error: BaseException) -> str | None:
     """One sentence for what the user can mend: what was given, and what is allowed. None for a bug."""
-    from hydra.errors import ConfigCompositionException, MissingConfigException
+    from hydra.errors import (
+        ConfigCompositionException,
+        InstantiationException,
+        MissingConfigException,
+        OverrideParseException,
+    )
     from omegaconf.errors import OmegaConfBaseException
 
     chain: list[BaseException] = [error]
@@ -129,12 +100,64 @@ def explain(error: BaseException) -> str | None:
             return str(link)
     text = " ".join(" ".join(str(link).split()) for link in chain[:2])
     text = text.split(" Config search path:")[0]
+    if isinstance(error, OverrideParseException):
+        return (
+            f"{error.override!r} cannot be read: type KEY=VALUE without spaces around the =, and lists, braces and "
+            "spaces in quotes, for instance stage=gan 'overlap=[30,50]'."
+        )
     if isinstance(error, MissingConfigException):
         return text
-    if (found := re.search(r"Could not override '([^']+)'", text)) and "." not in found[1]:
-        return _no_key(found[1])
+    if found := re.search(r"Could not override '([^'@]+)'", text):
+        root = getattr(chain[-1], "parent_node", None)
+        while root is not None and root._get_parent() is not None:
+            root = root._get_parent()
+        return no_key(found[1], root, conf_dir())
     if found := re.search(r"Missing mandatory value: (\S+)", text):
         return f"{found[1]} has no value: give {found[1]}=VALUE on the command line."
+    if isinstance(error, InstantiationException):
+        return _not_built(str(error), chain[-1])
+    if (sentence := _not_measured(text)) is not None:
+        return sentence
+    if _misconfigured(error):
+        return f"The trainer refuses this: {text}"
     if isinstance(error, ConfigCompositionException | OmegaConfBaseException):
         return f"The configuration refuses this: {text}. Type `python train.py --cfg job` to see every key."
     return None
+
+
+def _not_built(message: str, cause: BaseException) -> str | None:
+    """A sentence for a part that cannot be built; None for a bug in it."""
+    if found := re.search(r"Error (?:locating|loading) (?:target )?'([^']+)'", message):
+        if not isinstance(cause, ImportError | AttributeError):  # it was found, and fails by itself
+            return None
+        return (
+            f"_target_={found[1]} was not found ({_one_line(cause)}): give MODULE.NAME of a module that can be "
+            "imported, in the working folder or on PYTHONPATH."
+        )
+    found = re.search(r"call to target '(\w+)\.", message)
+    arguments = "argument" in str(cause) and isinstance(cause, TypeError)
+    of_ours = found is not None and found[1] in ("overfly", "lightning", "torch")
+    if not arguments and not (of_ours and (isinstance(cause, TypeError | ValueError) or _misconfigured(cause))):
+        return None
+    key = re.search(r"full_key: (\S+)", message)
+    part = key[1] if key else "trainer" if "trainer.Trainer'" in message else "A part"
+    return f"{part} cannot be built as it is configured: {_one_line(cause)}."
+
+
+def _misconfigured(error: BaseException) -> bool:
+    """Whether Lightning refuses what it was given (its exception takes seconds to import)."""
+    return type(error).__name__ == "MisconfigurationException"
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()).rstrip(".!")
+
+
+def _not_measured(text: str) -> str | None:
+    """A sentence for a monitored metric that no epoch has measured."""
+    found = re.search(r"monitor='([^']+)'\)` could not find .* returned metrics: \[(.*?)\]", text)
+    found = found or re.search(r"conditioned on metric `([^`]+)` which is not available.*following: `(.*?)`\s*$", text)
+    if found is None:
+        return None
+    measured = re.findall(r"(?:val|train)/\w+", found[2])
+    return str(unknown("The metric", found[1], measured, "Type monitor=NAME with one of them."))

@@ -82,3 +82,36 @@ def test_another_file_of_the_same_name_is_another_flight(hall: Path, tmp_path: P
 def test_neither_a_style_nor_a_file_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'suburbs' is unknown; did you mean 'suburb'\?.*a file of a scene"):
         flights(tmp_path, styles=["suburbs"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"images": {"train": -1}}, "images.train=-1 is not possible"),
+        ({"images": {"train": "abc"}}, "images.train=abc is not possible"),
+        ({"images": {"train": 1.5}}, "images.train=1.5 is not possible"),
+        ({"images": 5}, "a number for each of train, val"),
+        ({"cells": []}, "at least one"),
+        ({"cells": [{"altitude": 100}]}, "overlap .0 to 95 percent., share"),
+        ({"cells": [{"altitude": 5, "overlap": 60, "share": 1}]}, "altitude .20 to 500 m."),
+        ({"cells": [{"altitude": 60, "overlap": 60, "share": 0}]}, "share .above 0."),
+        ({"cells": [{"altitude": 60, "overlap": 60, "share": 1, "path": "grid"}]}, "flight_path="),
+        ({"cells": [{"altitude": 60, "overlap": 60, "share": 1, "flight_path": {"name": "gird"}}]}, "'grid'"),
+        ({"flight_path": {"name": "grid", "heading": 5}}, "did you mean 'flight_path.heading_deg'"),
+    ],
+)
+def test_counts_cells_and_paths_that_cannot_be_are_one_sentence(
+    changes: dict[str, Any], says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=says):
+        flights(tmp_path, **changes)
+
+
+def test_a_path_may_be_turned_and_a_cell_may_have_one_of_its_own(tmp_path: Path) -> None:
+    path = {"name": "circular", "tilt_deg": 30}
+    cells = [
+        {"altitude": 60, "overlap": 60, "share": 1},
+        {"altitude": 90, "overlap": 60, "share": 1, "flight_path": path},
+    ]
+    source = flights(tmp_path, cells=cells, flight_path={"name": "grid", "heading_deg": 45}, images={"test": 8})
+    assert [job.flight_path for job in source.jobs("test")] == [{"name": "grid", "heading_deg": 45}, path]

@@ -69,9 +69,10 @@ class FolderFlights:
                 f"{root} has no reference cloud to learn from: put reference.laz (or .ply) in the folder, in the "
                 f"cameras' frame, or give data.source.reference=...; `overfly map {root} --out OUT` makes a cloud."
             )
-        files = [*(frame.path for frame in frames), reference, *root.glob("transforms.json")]
+        cameras = (*root.glob("*.json"), *root.glob("geo.txt"), *root.glob("sparse/*.*"), *root.glob("sparse/0/*.*"))
+        files = [*(frame.path for frame in frames), reference, *sorted(cameras)]
         facts = [(str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
-        content = json.dumps([facts, self.image_size, split, scene, "1"])
+        content = json.dumps([facts, self.image_size, split, scene, "2"])
         folder = self.folder / hashlib.sha256(content.encode()).hexdigest()[:20]
         return cached(folder, lambda: self._record(flight, frames, reference, scene))
 
@@ -83,13 +84,14 @@ class FolderFlights:
                 f"type `overfly map {flight.root} --out OUT` first and copy OUT/transforms.json into it."
             )
         n = len(frames)
-        test, val = round(n * self.test_share), max(1, round(n * self.val_share))
+        # A window of one frame sees no depth: each split gets two at least.
+        test, val = (max(2, round(n * share)) if share else 0 for share in (self.test_share, self.val_share))
         bounds = {"train": (0, n - val - test), "val": (n - val - test, n - test), "test": (n - test, n)}
         first, last = bounds[split]
-        if last - first < 1:
+        if last - first < 2 or first < 0:
             raise InputError(
-                f"{flight.root} has {n} frames with cameras, which leaves none for {split}: "
-                "give a larger flight or smaller data.source.val_share and test_share."
+                f"{flight.root} has {n} frames with cameras, which leaves {max(0, last - first)} for {split} of 2 that "
+                "are needed: give a larger flight or smaller data.source.val_share and test_share."
             )
         return frames[first:last]
 

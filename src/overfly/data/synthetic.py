@@ -15,11 +15,15 @@ from overfly.data.flight_job import FlightJob, record_flight, scene_version
 from overfly.data.record import cached
 from overfly.errors import InputError, unknown
 from overfly.flights import CAMERAS, PATHS
+from overfly.flights.plan import ALTITUDE_RANGE, OVERLAP_RANGE
 from overfly.scenes import STYLES
 
 log = logging.getLogger("overfly")
 
 SPLITS = ("train", "val", "test", "unseen")
+
+PATH_OPTIONS = ("tilt_deg", "heading_deg", "terrain_follow")
+"""What a flight path may say beside its name; see :func:`overfly.flights.plan_flight`."""
 
 
 class SyntheticFlights:
@@ -57,17 +61,29 @@ class SyntheticFlights:
         for style in [*styles, *unseen_styles]:
             if style not in STYLES and not Path(style).expanduser().is_file():
                 raise unknown("The style", style, [*STYLES, "a file of a scene (.laz, .ply, .tif, ...)"])
+        flight_paths = [flight_paths] if isinstance(flight_paths, str) else flight_paths
         paths = [{"name": name} for name in flight_paths] if flight_paths else [dict(flight_path)]
         for path in paths:
-            if path["name"] not in PATHS:
-                raise unknown("The flight path", path["name"], PATHS)
+            _check_path(path)
         if camera not in CAMERAS:
             raise unknown("The camera", camera, CAMERAS)
         if images_per_flight < 2:
             raise InputError(f"images_per_flight={images_per_flight} is too few: give 2 or more.")
+        if not isinstance(images, dict):
+            raise InputError(
+                f"data.source.images={images} is not possible: give a number for each of {', '.join(SPLITS)}."
+            )
         if unsplit := set(images) - set(SPLITS):
             raise InputError(f"images names {sorted(unsplit)}, but the splits are {', '.join(SPLITS)}.")
-        if cells is None:
+        for split, count in images.items():
+            if type(count) is not int or count < 0:
+                raise InputError(
+                    f"data.source.images.{split}={count} is not possible: give a whole number, 0 or more, for instance "
+                    f"data.source.images.{split}=120."
+                )
+        if cells is not None:
+            _check_cells(cells)
+        else:
             cells = [
                 {"altitude": a, "overlap": o, "share": 1.0, "flight_path": path}
                 for a, o, path in product(_listed(altitude), _listed(overlap), paths)
@@ -177,6 +193,31 @@ class SyntheticFlights:
 
 def _make(job: FlightJob, folder: Path) -> None:
     cached(folder, lambda: record_flight(job))
+
+
+def _check_path(path: dict[str, Any]) -> None:
+    if path["name"] not in PATHS:
+        raise unknown("The flight path", path["name"], PATHS)
+    if strange := set(path) - {"name", *PATH_OPTIONS}:
+        raise unknown("The key", f"flight_path.{min(strange)}", [f"flight_path.{key}" for key in PATH_OPTIONS])
+
+
+def _check_cells(cells: Sequence[dict[str, Any]]) -> None:
+    bounds = {"altitude": ALTITUDE_RANGE, "overlap": OVERLAP_RANGE, "share": (1e-6, 1e9)}
+    if not isinstance(cells, Sequence) or not cells:
+        raise InputError("data.source.cells has no cell: give a list of at least one, or data.source.cells=null.")
+    for cell in cells:
+        possible = isinstance(cell, dict) and set(bounds) <= set(cell) <= {*bounds, "flight_path"}
+        if not possible or not all(
+            isinstance(cell[key], int | float) and low <= cell[key] <= high for key, (low, high) in bounds.items()
+        ):
+            raise InputError(
+                f"{cell} is not possible as one of data.source.cells: give altitude (20 to 500 m), overlap (0 to 95 "
+                "percent), share (above 0) and, where it has one of its own, flight_path={name: grid}, for instance "
+                "[{altitude: 100, overlap: 60, share: 1}]."
+            )
+        if "flight_path" in cell:
+            _check_path(cell["flight_path"])
 
 
 def _listed(value: float | Sequence[float]) -> list[float]:
