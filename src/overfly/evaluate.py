@@ -103,16 +103,19 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
 QUESTION = "question.json"
 """What an evaluation measures and of which weights, so that a resumed one does not mix two."""
 
-NO_MATTER = ("workers", "batch_size")
-"""Keys of the data that change no number."""
+NO_MATTER = ("workers", "batch_size", "processes", "cache_dir")
+"""Keys of the data and their source that change no number."""
 
 
 def _same_question(cfg: DictConfig, networks: Mapping[str, Network], run_dir: Path) -> None:
     """Keep what is asked; refuse to go on with windows that were measured with other data, settings or weights."""
     data = OmegaConf.to_container(cfg.data, resolve=True)
     assert isinstance(data, dict)
+    source = data.get("source")
+    if isinstance(source, dict):
+        data["source"] = {key: value for key, value in source.items() if key not in NO_MATTER}
     question: dict[str, Any] = {str(key): value for key, value in data.items() if key not in NO_MATTER}
-    question |= {key: cfg[key] for key in ("every", "emd_windows", "draws", "points", "seed", "cameras")}
+    question |= {key: cfg[key] for key in ("every", "emd_windows", "points", "seed", "cameras")}
     asked = {key: _digest(json.dumps(value, sort_keys=True).encode()) for key, value in question.items()}
     for name, network in networks.items():
         weights = [
@@ -120,8 +123,8 @@ def _same_question(cfg: DictConfig, networks: Mapping[str, Network], run_dir: Pa
         ]
         asked[f"the weights of {name}"] = _digest(*weights)
     path = run_dir / QUESTION
-    if cfg.resume and path.is_file():
-        before = json.loads(path.read_text())
+    if cfg.resume and (run_dir / KEPT).is_file():
+        before = json.loads(path.read_text()) if path.is_file() else {}
         if other := sorted(key for key in before.keys() | asked.keys() if before.get(key) != asked.get(key)):
             raise InputError(
                 f"{run_dir} was measured with other values of {', '.join(other)}: resume it without other overrides, "

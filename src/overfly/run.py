@@ -51,17 +51,23 @@ def train(cfg: DictConfig) -> float | None:
 
 def _train_phases(cfg: DictConfig, run_dir: Path) -> float | None:
     """The phases one after the other, each from the weights of the one before it."""
-    value, before = None, cfg.from_run
+    value, before, changed = None, cfg.from_run, ""
     for name, phase in cfg.phases.items():
         part = OmegaConf.merge(cfg, phase, {"run_dir": str(run_dir / name), "from_run": before})
         assert isinstance(part, DictConfig)
         done = run_dir / name / "metrics.json"
-        if cfg.resume and done.is_file() and not _goes_on(run_dir / name, part):
+        goes_on = cfg.resume and done.is_file() and _goes_on(run_dir / name, part)
+        if goes_on:
+            done.unlink()  # it is not finished any more, should this be stopped
+        if cfg.resume and done.is_file():
+            if changed:
+                log.warning("%s: kept as it was, though %s was trained on: give it more epochs, too", name, changed)
             log.info("%s: finished before, its results in %s are kept", name, done.parent)
             value = json.loads(done.read_text()).get("monitored")
         else:
             _open_folder(part, Path(part.run_dir))
             value = _train_stage(part)
+            changed = name
         before = part.run_dir
         if _leads():
             collect(run_dir, list(cfg.phases))

@@ -124,11 +124,14 @@ def same_stage(folder: Path, stage: str) -> None:
 @contextmanager
 def as_it_was(folder: Path) -> Iterator[None]:
     """If going on fails, a run folder and its phases keep what they said: a bad override must not stay in them."""
-    files = [top / name for top in (folder, *(folder / phase for phase in PHASES)) for name in SAID]
-    before = {path: path.read_bytes() for path in files if path.is_file()}
+    tops = (folder, *(folder / phase for phase in PHASES))
+    before = {path: path.read_bytes() for top in tops for name in SAID if (path := top / name).is_file()}
+    weights = {path: path.stat().st_mtime_ns for top in tops if (path := top / "checkpoints" / "last.ckpt").is_file()}
     try:
         yield
     except Exception:
+        if any(path.stat().st_mtime_ns != time for path, time in weights.items()):
+            raise  # it has trained as it was asked to
         for path, content in before.items():
             path.write_bytes(content)
         raise

@@ -66,8 +66,8 @@ def test_gps_brings_a_model_to_metres(line: bool, tmp_path: Path) -> None:
     assert np.abs(found[:, :3, 3] - places).max() < (2.0 if line else 0.1)
     turns = Rotation.from_matrix(np.einsum("nij,nik->njk", found[:, :3, :3], expected[:, :3, :3])).magnitude()
     assert np.rad2deg(turns).max() < (1.0 if line else 0.1)
-    (told,) = [sentence for sentence in flight.warnings if "were brought to the images' GPS" in sentence]
-    assert "sparse" in told
+    told = flight.facts["located"]
+    assert "The cameras of sparse were brought to the images' GPS" in told
     assert "one of its units is 50 m" in told
 
 
@@ -81,7 +81,7 @@ def test_without_gps_a_model_is_levelled(points: bool, most: float, tmp_path: Pa
     true = np.stack([at[:3, 2] for at in stood(False)])
     turn, _ = Rotation.align_vectors(views, true)
     assert np.rad2deg(np.arccos(turn.as_matrix()[2, 2])) < most
-    assert not any("GPS" in sentence and "brought" in sentence for sentence in flight.warnings)
+    assert "located" not in flight.facts
 
 
 def test_a_model_that_is_level_keeps_its_frame(tmp_path: Path) -> None:
@@ -91,6 +91,32 @@ def test_a_model_that_is_level_keeps_its_frame(tmp_path: Path) -> None:
     found = read_flight(tmp_path).frames[3].world_from_camera
     assert found is not None
     np.testing.assert_allclose(np.asarray(found)[:3, 3], SCALE * lean @ stood(False)[3][:3, 3] + [1, 2, 3], atol=1e-9)
+
+
+def test_gps_that_tells_no_scale_is_not_followed(tmp_path: Path) -> None:
+    """All fixes within a metre, as some receivers write where they have lost their satellites."""
+    model(tmp_path, stood(False), gps=True, points=True)
+    rows = (tmp_path / "geo.txt").read_text().splitlines()
+    rng = np.random.default_rng(2)
+    rows[1:] = [
+        f"im{i}.png {8 + 1e-5 * a:.9f} {46 + 1e-5 * b:.9f} 550" for i, (a, b) in enumerate(rng.normal(size=(8, 2)))
+    ]
+    (tmp_path / "geo.txt").write_text("\n".join(rows))
+    flight = read_flight(tmp_path)
+    assert flight.origin is None
+    assert "located" not in flight.facts
+
+
+def test_an_oblique_model_that_is_level_keeps_its_frame_without_points(tmp_path: Path) -> None:
+    poses = [pose(rotation_from_gimbal(0, -40), [20.0 * i, 5.0 * (i % 2), 80]) for i in range(6)]
+    model(tmp_path, poses, gps=False, turn=np.eye(3))
+    np.testing.assert_allclose(read_flight(tmp_path).frames[2].world_from_camera[:3, :3], poses[2][:3, :3], atol=1e-9)  # type: ignore[index]
+
+
+def test_a_model_beside_a_reference_cloud_stays_in_its_frame(tmp_path: Path) -> None:
+    model(tmp_path, stood(False), gps=True)
+    (tmp_path / "reference.ply").touch()
+    assert read_flight(tmp_path).origin is None
 
 
 def test_points_of_a_binary_model(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from overfly.flights import ControlPoint, Flight, Frame
 from overfly.flights.georeference import moved_poses
-from overfly.flights.locate import BY_GPS
 from overfly.geodesy import Origin, crs_from_enu, geodetic_from_enu
 from overfly.geometry import Array, Camera, pose, project, rotation_from_gimbal
 from overfly.mapping.block import Block, read_block, write_block
@@ -54,7 +53,7 @@ def stands(block: Block) -> Array:
 def test_controls_place_a_model_that_stands_nowhere_or_by_gps_alone(located: bool, tmp_path: Path) -> None:
     shifted = np.eye(4)
     shifted[:3, 3] = 3, -2, 5
-    found = flight(shifted, ORIGIN, {"located": BY_GPS}) if located else flight(FREE, None, {})
+    found = flight(shifted, ORIGIN, {"located": "By GPS."}) if located else flight(FREE, None, {})
     block = given_block(found, "split")
     assert block.metric
     assert block.origin is not None
@@ -84,12 +83,22 @@ def test_cameras_that_stand_on_the_earth_are_checked_and_stay() -> None:
     assert any("all 6 points that two images see check it" in words for words in block.warnings)
 
 
+def test_one_wrong_control_of_four_does_not_tilt_cameras_that_gps_has_placed() -> None:
+    found = flight(np.eye(4), ORIGIN, {"located": "By GPS."}, wrong=30.0)
+    block = given_block(replace(found, gcps=found.gcps[:4]), "all")
+    assert any("p1 contradicts the others" in words for words in block.warnings)
+    off = (stands(block) - geodetic_from_enu(POSES[:, :3, 3], ORIGIN)) * [111_200, 77_000, 1]
+    assert np.abs(off).max() < 0.05
+    assert "By GPS." not in block.warnings  # the controls hold it now
+    assert "By GPS." in given_block(found, "none").warnings
+
+
 def test_a_wrong_point_is_named_and_too_few_place_nothing() -> None:
     block = given_block(flight(FREE, None, {}, wrong=12.0), "all")
     assert any("p1 contradicts the others" in words for words in block.warnings)
     assert any("nothing checks it" in words for words in block.warnings)
     found = flight(FREE, None, {})
-    for gcps, words in ((found.gcps[:2], "2 points are too few"), (found.gcps[:3], None)):
+    for gcps, words in ((found.gcps[:2], "2 points cannot place the cameras"), (found.gcps[:3], None)):
         block = given_block(replace(found, gcps=gcps), "split")
         assert block.metric == (words is None)
         assert words is None or any(words in sentence for sentence in block.warnings)

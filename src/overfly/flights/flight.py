@@ -144,7 +144,7 @@ class Flight:
         root: the folder.
         origin: where the world frame of the cameras stands; None where it is unknown or there are no cameras.
         cameras_from: "transforms.json", "sparse/0" or "reconstruction.json"; None without cameras.
-        facts: the ``overfly`` block of transforms.json.
+        facts: the ``overfly`` block of transforms.json; ``located``: how cameras of a model came to the images' GPS.
         warnings: sentences for the user, each once.
         skipped: image files that could not be used, with the reason.
         reference: reference cloud in the cameras' frame.

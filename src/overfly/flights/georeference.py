@@ -170,6 +170,7 @@ def by_ground(positions: Array, points: Array, rotations: Array, seed: int) -> A
     """
     rng = np.random.default_rng(seed)
     view = rotations[:, :, 2].mean(0)
+    view /= max(float(np.linalg.norm(view)), 1e-9)  # on an orbit the views all but cancel out
     spread = float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
     best, normal, offset = -1, -view, 0.0
     for _ in range(2000):

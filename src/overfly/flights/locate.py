@@ -8,30 +8,31 @@ import numpy as np
 
 from overfly.errors import InputError
 from overfly.flights.flight import Flight
-from overfly.flights.georeference import by_gps, by_ground, level_line, moved_poses, on_a_line, upright
+from overfly.flights.georeference import by_gps, by_ground, moved_poses, upright
 from overfly.geodesy import Origin, enu_from_geodetic
 from overfly.geometry import Array, transform
 
 FREE = ("sparse", "sparse/0", "reconstruction.json")
 """Sources of cameras that are free where they have no origin; transforms.json is in metres, z up, by definition."""
 
-BY_GPS = "gps"
-"""Fact ``located`` of a flight whose cameras have their place and scale by the images' GPS alone."""
-
 LEVEL_DEG = 20.0
 """Without GPS a model's frame is kept if its z axis is so near to the vertical that its ground or cameras tell."""
 
-FEWEST_POINTS = 50
-"""Points of a model that tell its ground."""
+FEWEST_POINTS, MOST_POINTS = 50, 5000
+"""Points of a model that tell its ground, and how many of them are looked at."""
+
+AMISS = 0.2
+"""Share of the spread of the GPS positions by which cameras may miss them, or they tell no scale."""
 
 
 def located(flight: Flight) -> Flight:
     """The flight, its cameras in local ENU metres by the images' GPS if they come from a model without an origin.
 
     Without GPS the cameras are levelled by the model's points, else by the gimbals or their mean view, unless the
-    model's z axis points up already; their scale stays unknown.
+    model's z axis points up already; their scale stays unknown. Where a reference cloud lies beside them, in their own
+    frame, they stay as they are.
     """
-    if flight.cameras_from not in FREE or flight.origin is not None:
+    if flight.cameras_from not in FREE or flight.origin is not None or flight.reference is not None:
         return flight
     own = [k for k, frame in enumerate(flight.frames) if frame.world_from_camera is not None]
     if len(own) < 2:
@@ -45,9 +46,9 @@ def located(flight: Flight) -> Flight:
             raise InputError("The images carry no GPS.")
         told = told[own]
         matrix = by_gps(centres, told, gimbals, turns)
-        if on_a_line(told):
-            moved = moved_poses(matrix, poses)
-            matrix = level_line(moved[:, :3, 3], gimbals, moved[:, :3, :3]) @ matrix
+        away = np.linalg.norm((transform(matrix, centres) - told)[:, :2], axis=1)
+        if np.sqrt(np.nanmean(away**2)) > AMISS * np.sqrt(np.nanvar(told[:, :2], axis=0).sum()):
+            raise InputError("The GPS positions do not fit the cameras.")
     except InputError:
         matrix, origin = _levelled(flight, centres, turns, gimbals), None
     frames = list(flight.frames)
@@ -55,20 +56,14 @@ def located(flight: Flight) -> Flight:
         frames[k] = replace(frames[k], world_from_camera=moved_pose)
     if origin is None:
         return replace(flight, frames=frames)
-    assert told is not None
-    away = np.linalg.norm((transform(matrix, centres) - told)[:, :2], axis=1)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    sentence = (
+    rms = float(np.sqrt(np.nanmean(away**2)))
+    says = (
         f"The cameras of {flight.cameras_from} were brought to the images' GPS: one of its units is {scale:.4g} m, and "
-        f"they are {float(np.sqrt(np.nanmean(away**2))):.2f} m off it (RMS, horizontal)."
+        f"they are {rms:.2f} m off it (RMS, horizontal)."
     )
-    return replace(
-        flight,
-        frames=frames,
-        origin=origin,
-        facts={**flight.facts, "located": BY_GPS},
-        warnings=[*flight.warnings, sentence],
-    )
+    facts = {**flight.facts, "located": says}
+    return replace(flight, frames=frames, origin=origin, facts=facts)
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:
@@ -95,10 +90,13 @@ def _levelled(flight: Flight, centres: Array, turns: Array, gimbals: list[tuple[
     assert flight.cameras_from is not None
     model = flight.root / flight.cameras_from
     points = read_colmap_points(model) if model.is_dir() else np.zeros((0, 3))
+    points = points[:: len(points) // MOST_POINTS + 1]
+    matrix, surely = np.eye(4), np.cos(np.deg2rad(LEVEL_DEG))
     if len(points) >= FEWEST_POINTS:
         matrix = by_ground(centres, points, turns, seed=0)
     else:
-        matrix = np.eye(4)
         matrix[:3, :3] = upright(gimbals, turns)
+        if all(gimbal is None for gimbal in gimbals):  # the mean view of oblique images is no vertical
+            surely = 0.0
     up = matrix[2, :3] / np.linalg.norm(matrix[2, :3])
-    return np.eye(4) if up[2] > np.cos(np.deg2rad(LEVEL_DEG)) else matrix
+    return np.eye(4) if up[2] > surely else matrix

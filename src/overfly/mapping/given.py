@@ -9,8 +9,8 @@ import numpy as np
 from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.flights.georeference import moved_poses
-from overfly.flights.locate import BY_GPS
-from overfly.geometry import fit_similarity
+from overfly.geodesy import enu_from_geodetic, geodetic_from_enu
+from overfly.geometry import Array, fit_similarity
 from overfly.mapping.block import Block, checked
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.clicks import Control, see
@@ -18,7 +18,6 @@ from overfly.mapping.control import (
     FEWEST,
     checks_of,
     consistent,
-    control_crs,
     control_origin,
     flat,
     read_controls,
@@ -49,14 +48,17 @@ def given_block(flight: Flight, control: str = "none") -> Block:
     metric = flight.origin is not None or flight.cameras_from == "transforms.json"
     metric = metric and flight.facts.get("scale") != "unknown"  # as our own transforms.json says of such blocks
     block = checked(Block(frames, flight.origin, flight.cameras_from, metric), flight)
-    if not flight.gcps or control == "none":
-        return block
-    free = flight.origin is None or flight.facts.get("located") == BY_GPS
-    origin = (control_origin(flight.gcps) if free else None) or flight.origin
-    if origin is None:
-        why = f"Ground control was not used: {len(flight.gcps)} points are too few to place the cameras, three needed."
-        return replace(block, warnings=[why])
-    return _surveyed(block, replace(block, origin=origin, metric=True), flight, control, free)
+    located = flight.facts.get("located")
+    if flight.gcps and control != "none":
+        free = flight.origin is None or located is not None
+        origin = (control_origin(flight.gcps) if free else None) or flight.origin
+        if origin is None:
+            why = f"Ground control was not used: {len(flight.gcps)} points cannot place the cameras, three are needed."
+            return replace(block, warnings=[why])
+        block = _surveyed(block, replace(block, origin=origin, metric=True), flight, control, free)
+    if located is not None and (block.survey is None or block.survey.sigma_m is None):
+        block = replace(block, warnings=[*block.warnings, located])
+    return block
 
 
 def _surveyed(block: Block, placed: Block, flight: Flight, control: str, free: bool) -> Block:
@@ -75,7 +77,7 @@ def _surveyed(block: Block, placed: Block, flight: Flight, control: str, free: b
     check = np.ones(len(usable), bool)
     sigma: tuple[float, float] | None = None
     if free:
-        good = consistent(source, target, metric=False)
+        good = consistent(source, _in_frame(block, placed, target), metric=block.metric)
         warnings += [_contradicts(controls[i]) for i, fits in zip(usable, good, strict=True) if not fits]
         if good.sum() < FEWEST or flat(target[good]):
             warnings.append(
@@ -93,20 +95,27 @@ def _surveyed(block: Block, placed: Block, flight: Flight, control: str, free: b
         flat_m, up_m = (round(float(v), 4) for v in spread_m(source[~check], target[~check], scaled=True))
         sigma = flat_m, up_m
         poses = moved_poses(matrix, block.poses)
-        codes = control_crs(flight.gcps[0].crs)
-        block = replace(
-            placed,
-            frames=[replace(f, world_from_camera=pose) for f, pose in zip(block.frames, poses, strict=True)],
-            origin=replace(placed.origin, epsg=codes[0] or placed.origin.epsg, vertical_epsg=codes[1]),
-        )
+        frames = [replace(f, world_from_camera=pose) for f, pose in zip(block.frames, poses, strict=True)]
+        block = replace(placed, frames=frames)
     else:
         warnings.append(
             f"The cameras are given on the Earth, so that ground control does not hold the map: all {len(usable)} "
             "points that two images see check it. With --cameras estimate they hold it."
         )
+    shift = block.gps_residuals() if sigma is not None else np.full((1, 3), np.nan)
+    known = shift[np.isfinite(shift).all(1)]
+    east, north, up = (round(float(v), 3) for v in np.median(known, axis=0)) if len(known) else (0.0, 0.0, 0.0)
+    gps_shift = (east, north, up) if len(known) else None
     roles = {i: "check" if apart else "control" for i, apart in zip(usable, check, strict=True)}
     points = [residual_of(bundle, point, roles.get(i), sizes) for i, point in enumerate(controls)]
-    return replace(block, survey=Survey(tuple(points), sigma), warnings=warnings)
+    return replace(block, survey=Survey(tuple(points), sigma, gps_shift), warnings=warnings)
+
+
+def _in_frame(block: Block, placed: Block, target: Array) -> Array:
+    """Places [n, 3] about the origin of ``placed`` in a block's frame if it stands on the Earth; else as they are."""
+    if block.origin is None or placed.origin is None or not block.metric:
+        return target
+    return enu_from_geodetic(geodetic_from_enu(target, placed.origin), block.origin)
 
 
 def _contradicts(control: Control) -> str:

@@ -190,7 +190,7 @@ def _accuracy(summary: Mapping[str, Any], unit: str) -> list[dict[str, str]]:
         estimated = summary["cameras_from"] == "estimated"
         ruled = bool((summary.get("ground_control") or {}).get("controls"))
         how = "from ground control" if ruled else "from the GPS of the images"
-        how = how if estimated else f"as given by {summary['cameras_from']}"
+        how = how if estimated or ruled else f"as given by {summary['cameras_from']}"
         rows.append(("Metric scale", "known", how))
     else:
         rows.append(("Metric scale", "unknown", "no GPS, no origin: measure a known distance and scale by it"))

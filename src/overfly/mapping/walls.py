@@ -99,6 +99,9 @@ def wall_points(
     row, column, away, inside = looked_up(found, camera, world_from_camera)
     shown = np.flatnonzero(inside)
     shown = shown[blank[row[shown], column[shown]]]
+    block = max(1, int(np.ceil(cell / gsd)))
+    hidden = _hidden(points, row[shown], column[shown], away[shown], block, camera, world_from_camera, TALLEST * gsd)
+    shown = shown[~hidden]
     flat = row[shown] * camera.width + column[shown]
     nearest = np.full(camera.height * camera.width, np.inf)
     np.minimum.at(nearest, flat, away[shown])
@@ -106,6 +109,23 @@ def wall_points(
     found[:, :2] -= INWARD * gsd * outward  # after it was looked for where its edge was seen
     voxels = next(size for size in DIVISORS if size >= cell / gsd - 1e-6 or size == DIVISORS[-1])
     return found[shown], row[shown], column[shown], voxels
+
+
+def _hidden(
+    points: Array,
+    row: NDArray[np.intp],
+    column: NDArray[np.intp],
+    away: Array,
+    block: int,
+    camera: Camera,
+    world_from_camera: Array,
+    tallest: float,
+) -> NDArray[np.bool_]:
+    """Which pixels [N], so far away, have measured points [M, 3] before them, in blocks that surely hold one."""
+    there, beside, nearer, inside = looked_up(points, camera, world_from_camera)
+    nearest = np.full((-(-camera.height // block), -(-camera.width // block)), np.inf)
+    np.minimum.at(nearest, (there[inside] // block, beside[inside] // block), nearer[inside])
+    return np.asarray(nearest[row // block, column // block] < away - block * tallest)
 
 
 def looked_up(
