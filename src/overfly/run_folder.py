@@ -92,8 +92,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 PHASES = ("encoder", "gan", "full")
 """Of ``stage=all``: each has a run folder of its own in that of the whole."""
 
-SAID = ("config.yaml", "overrides.txt")
-"""Files of a run folder that say what was asked."""
+SAID = ("config.yaml", "overrides.txt", "metrics.json")
+"""Files of a run folder that say what was asked and what came out; the last also tells that it is finished."""
 
 
 def same_stage(folder: Path, stage: str) -> None:
