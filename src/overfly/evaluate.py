@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import re
@@ -18,6 +17,7 @@ from overfly.errors import InputError, unknown
 from overfly.evaluation import Baselines, Network, evaluate
 from overfly.evaluation.cameras import ESTIMATED, estimate_all
 from overfly.evaluation.evaluate import KEPT
+from overfly.networks.blocks import weights_key
 from overfly.run import Run
 from overfly.run_folder import write_json
 from overfly.shipped import load_network
@@ -28,6 +28,12 @@ CAMERAS = ("exact", "estimated")
 
 TRAINING_WINDOWS = 240
 """Training windows, spread over all flights, among which the mean and the nearest one are looked for."""
+
+QUESTION = "question.json"
+"""What an evaluation measures and of which weights, so that a resumed one does not mix two."""
+
+NO_MATTER = ("workers", "batch_size", "processes", "cache_dir")
+"""Keys of the data and their source that change no number."""
 
 
 def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
@@ -100,13 +106,6 @@ def evaluate_run(cfg: DictConfig, run_dir: Path) -> float | None:
     return next(float(row["chamfer_m2"]) for row in rows if row["cloud"] == own)
 
 
-QUESTION = "question.json"
-"""What an evaluation measures and of which weights, so that a resumed one does not mix two."""
-
-NO_MATTER = ("workers", "batch_size", "processes", "cache_dir")
-"""Keys of the data and their source that change no number."""
-
-
 def _same_question(cfg: DictConfig, networks: Mapping[str, Network], run_dir: Path) -> None:
     """Keep what is asked; refuse to go on with windows that were measured with other data, settings or weights."""
     data = OmegaConf.to_container(cfg.data, resolve=True)
@@ -114,14 +113,9 @@ def _same_question(cfg: DictConfig, networks: Mapping[str, Network], run_dir: Pa
     source = data.get("source")
     if isinstance(source, dict):
         data["source"] = {key: value for key, value in source.items() if key not in NO_MATTER}
-    question: dict[str, Any] = {str(key): value for key, value in data.items() if key not in NO_MATTER}
-    question |= {key: cfg[key] for key in ("every", "emd_windows", "points", "seed", "cameras")}
-    asked = {key: _digest(json.dumps(value, sort_keys=True).encode()) for key, value in question.items()}
-    for name, network in networks.items():
-        weights = [
-            tensor.detach().cpu().numpy().tobytes() for _, tensor in sorted(network.network.state_dict().items())
-        ]
-        asked[f"the weights of {name}"] = _digest(*weights)
+    asked: dict[str, Any] = {str(key): value for key, value in data.items() if key not in NO_MATTER}
+    asked |= {key: cfg[key] for key in ("every", "emd_windows", "points", "seed", "cameras")}
+    asked |= {f"the weights of {name}": weights_key(network.network) for name, network in networks.items()}
     path = run_dir / QUESTION
     if cfg.resume and (run_dir / KEPT).is_file():
         before = json.loads(path.read_text()) if path.is_file() else {}
@@ -131,13 +125,6 @@ def _same_question(cfg: DictConfig, networks: Mapping[str, Network], run_dir: Pa
                 "or evaluate into a new folder."
             )
     write_json(path, asked)
-
-
-def _digest(*parts: bytes) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part)
-    return digest.hexdigest()[:16]
 
 
 def _name(run: Run) -> str:

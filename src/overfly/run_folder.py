@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 WEIGHTS = Path(__file__).parent / "weights"
 """Where the shipped networks lie, as ``NAME.safetensors`` and ``NAME.json``."""
 
+PHASES = ("encoder", "gan", "full")
+"""Of ``stage=all``: each has a run folder of its own in that of the whole."""
+
 
 def checkpoint(folder: Path) -> Path | None:
     """The best checkpoint of a run folder, exported weights, or those of a shipped network by its name; None if there
@@ -35,7 +38,7 @@ def checkpoint(folder: Path) -> Path | None:
             f"There is no run folder {folder}: give a folder that train.py wrote, such as outputs/all/..., "
             f"or a shipped network ({', '.join(sorted(path.stem for path in WEIGHTS.glob('*.safetensors')))})."
         )
-    for part in (folder, folder / "full", folder / "gan", folder / "encoder"):
+    for part in (folder, *(folder / name for name in reversed(PHASES))):
         if (part / "checkpoints" / "best.ckpt").is_file():
             return part / "checkpoints" / "best.ckpt"
     exported = list(folder.glob("*.safetensors"))
@@ -88,9 +91,6 @@ def collect(run_dir: Path, phases: list[str]) -> None:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n")
 
-
-PHASES = ("encoder", "gan", "full")
-"""Of ``stage=all``: each has a run folder of its own in that of the whole."""
 
 SAID = ("config.yaml", "overrides.txt", "metrics.json")
 """Files of a run folder that say what was asked and what came out; the last also tells that it is finished."""

@@ -41,29 +41,38 @@ def located(flight: Flight) -> Flight:
     gimbals = [flight.frames[k].gimbal for k in own]
     centres, turns = poses[:, :3, 3], poses[:, :3, :3]
     origin, told = gps_frame(flight)
-    try:
-        if told is None:
-            raise InputError("The images carry no GPS.")
-        told = told[own]
-        matrix = by_gps(centres, told, gimbals, turns)
-        away = np.linalg.norm((transform(matrix, centres) - told)[:, :2], axis=1)
-        if np.sqrt(np.nanmean(away**2)) > AMISS * np.sqrt(np.nanvar(told[:, :2], axis=0).sum()):
-            raise InputError("The GPS positions do not fit the cameras.")
-    except InputError:
+    matrix = None if told is None else _by_gps(centres, told[own], gimbals, turns)
+    facts = dict(flight.facts)
+    if matrix is None or told is None:
         matrix, origin = _levelled(flight, centres, turns, gimbals), None
+    else:
+        facts["located"] = (
+            f"The cameras of {flight.cameras_from} were brought to the images' GPS: one of its units is "
+            f"{float(np.cbrt(np.linalg.det(matrix[:3, :3]))):.4g} m, and they are "
+            f"{_amiss(matrix, centres, told[own]):.2f} m off it (RMS, horizontal)."
+        )
     frames = list(flight.frames)
-    for k, moved_pose in zip(own, moved_poses(matrix, poses), strict=True):
-        frames[k] = replace(frames[k], world_from_camera=moved_pose)
-    if origin is None:
-        return replace(flight, frames=frames)
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    rms = float(np.sqrt(np.nanmean(away**2)))
-    says = (
-        f"The cameras of {flight.cameras_from} were brought to the images' GPS: one of its units is {scale:.4g} m, and "
-        f"they are {rms:.2f} m off it (RMS, horizontal)."
-    )
-    facts = {**flight.facts, "located": says}
+    for k, moved in zip(own, moved_poses(matrix, poses), strict=True):
+        frames[k] = replace(frames[k], world_from_camera=moved)
     return replace(flight, frames=frames, origin=origin, facts=facts)
+
+
+def _by_gps(
+    centres: Array, told: Array, gimbals: list[tuple[float, float, float] | None], turns: Array
+) -> Array | None:
+    """The similarity that brings cameras to their GPS; None where that tells no scale."""
+    try:
+        matrix = by_gps(centres, told, gimbals, turns)
+    except InputError:
+        return None
+    spread = float(np.sqrt(np.nanvar(told[:, :2], axis=0).sum()))
+    return matrix if _amiss(matrix, centres, told) <= AMISS * spread else None
+
+
+def _amiss(matrix: Array, centres: Array, told: Array) -> float:
+    """RMS of the horizontal distances between cameras, moved by a similarity, and their GPS, metres."""
+    away = np.linalg.norm((transform(matrix, centres) - told)[:, :2], axis=1)
+    return float(np.sqrt(np.nanmean(away**2)))
 
 
 def gps_frame(flight: Flight) -> tuple[Origin | None, Array | None]:

@@ -90,17 +90,7 @@ def controlled(
     bundle, sizes = result.bundle, _sizes(flight, result.bundle)
     controls = read_controls(flight, bundle, origin, warnings)
     seen = [see(bundle, control, sizes, warnings) for control in controls]
-    usable = [i for i, view in enumerate(seen) if view is not None]
-    source = np.array([seen[i].point for i in usable]).reshape(-1, 3)  # type: ignore[union-attr]
-    target = np.array([controls[i].place for i in usable]).reshape(-1, 3)
-    good = consistent(source, target, metric=with_gps)
-    for i, fits in zip(usable, good, strict=True):
-        if not fits:
-            warnings.append(
-                f"The control point {controls[i].name} contradicts the others and was not used: check its coordinates "
-                "and its pixels in gcp_list.txt."
-            )
-    usable = [i for i, fits in zip(usable, good, strict=True) if fits]
+    usable = fitting(controls, seen, metric=with_gps, warnings=warnings)
     target = np.array([controls[i].place for i in usable]).reshape(-1, 3)
     if len(usable) < FEWEST or (flat(target) and not with_gps):
         why = "lie on a line" if len(usable) >= FEWEST else "are too few, three are needed"
@@ -133,6 +123,21 @@ def controlled(
         None if shift is None else (round(east, 3), round(north, 3), round(up, 3)),
     )
     return Controlled(final, survey, len(views), True, control_crs(flight.gcps[0].crs))
+
+
+def fitting(
+    controls: Sequence[Control], seen: Sequence[Seen | None], *, metric: bool, warnings: list[str]
+) -> list[int]:
+    """Numbers of the controls that are seen and fit together (:func:`consistent`); contradicting ones are named."""
+    usable = [i for i, view in enumerate(seen) if view is not None]
+    source = np.array([view.point for view in seen if view is not None]).reshape(-1, 3)
+    good = consistent(source, np.array([controls[i].place for i in usable]).reshape(-1, 3), metric=metric)
+    for i in (i for i, fits in zip(usable, good, strict=True) if not fits):
+        warnings.append(
+            f"The control point {controls[i].name} contradicts the others and was not used: check its coordinates and "
+            "its pixels in gcp_list.txt."
+        )
+    return [i for i, fits in zip(usable, good, strict=True) if fits]
 
 
 def _weighed(

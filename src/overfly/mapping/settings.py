@@ -133,14 +133,10 @@ class MapSettings:
 
     def network_key(self) -> str:
         """What a trained run's answer depends on: its weights."""
-        import hashlib
+        from overfly.networks.blocks import weights_key
 
-        digest = hashlib.sha256()
         assert self.run is not None
-        for name, value in self.run.network.state_dict().items():
-            digest.update(name.encode())
-            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return weights_key(self.run.network)
 
     def shown(self) -> dict[str, Any]:
         """For the report and map.json."""

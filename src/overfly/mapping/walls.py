@@ -86,8 +86,7 @@ def wall_points(
     points = measured_points(np.where(measured, depth, np.nan), camera, world_from_camera, PIXELS)
     if not len(points):
         return nothing
-    middle = float(np.median(depth[np.isfinite(depth) & measured]))
-    gsd = middle / camera.fx
+    gsd = _middle(depth[measured]) / camera.fx
     cell = max(CELL_M, CELL_PIXELS * gsd)
     points = np.concatenate([points, *around])
     seen = surface(Cloud(points), grid_over(points, cell, trim=0.0005))
@@ -139,16 +138,20 @@ def looked_up(
 
 def measured_points(depth: Map, camera: Camera, world_from_camera: Array, pixels: int = 1) -> Array:
     """What a depth map [H, W] holds, so many pixels along a cell: points [N, 3]; not what is farther than most."""
-    known = np.isfinite(depth)
-    if not known.any():
+    if np.isnan(middle := _middle(depth)):
         return np.zeros((0, 3))
-    middle = float(np.median(depth[known]))
     gsd = middle / camera.fx
     step = max(1, int(max(CELL_M, CELL_PIXELS * gsd) / gsd / pixels))
     with np.errstate(invalid="ignore"):
         rows, columns = (k * step for k in np.nonzero(depth[::step, ::step] < FARTHEST * middle))
     at = np.stack([columns + 0.5, rows + 0.5], axis=1)
     return unproject(at, depth[rows, columns], camera, world_from_camera)
+
+
+def _middle(depth: Map) -> float:
+    """The median of the depths that are known, NaN of none."""
+    known = depth[np.isfinite(depth)]
+    return float(np.median(known)) if len(known) else float("nan")
 
 
 def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import torch
 from torch import Tensor, nn
 
@@ -72,3 +74,12 @@ def grid_side(points: int) -> int:
         near = max(1, side) ** 2
         raise InputError(f"points={points} is not a square number, which the initial cloud needs: take points={near}.")
     return side
+
+
+def weights_key(network: nn.Module) -> str:
+    """Hexadecimal digits that depend on all weights of a network."""
+    digest = hashlib.sha256()
+    for name, value in network.state_dict().items():
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
