@@ -12,6 +12,7 @@ from overfly.flights import Frame
 from overfly.geometry import Camera, fit_similarity, pose, project, rotation_from_gimbal, transform
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.calibration import adjusted_twice, held_by_images
+from overfly.mapping.placing import placed_by_others, without_faults
 from overfly.mapping.ties import unchecked_ties, untied
 
 CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
@@ -59,6 +60,27 @@ def test_few_ties_are_left_out_and_enough_are_kept(ties: int, stands: bool) -> N
     assert len(left.points) == len(bundle.points), "of every point two rays are left"
     assert bool(out.any()) != stands
     assert untied(left).tolist() == [not stands, not stands, False, False, False]
+
+
+def test_gps_is_only_wrong_where_other_images_tell_so(tmp_path: Path) -> None:
+    """An image at the end of a line, which pairs alone hold, may have run off along its base: GPS is what holds it."""
+    bundle = line(PAIRS + FIRM)
+    gps = PLACES.copy()
+    gps[0, 1] -= 300.0
+    gps[4, 0] += 300.0
+    frames = [Frame(f"{k}.jpg", tmp_path / f"{k}.jpg", 800, 600) for k in range(len(PLACES))]
+    warnings: list[str] = []
+    found = without_faults(bundle, gps, frames, warnings)
+    assert np.isnan(found[4]).all()
+    np.testing.assert_array_equal(found[:4], gps[:4])
+    assert len(warnings) == 1
+    assert "1 images (4.jpg)" in warnings[0]
+
+
+def test_wrong_gps_of_images_in_a_row_is_wrong_together() -> None:
+    chain = line([(0, 1, 2), (1, 2, 3), (2, 3, 4)] * 20)
+    assert placed_by_others(chain, np.array([True, True, False, False, False])).all()
+    assert not placed_by_others(line(PAIRS + FIRM), np.array([True, True, False, False, False]))[2:].any()
 
 
 def test_many_matches_ask_for_more_ties() -> None:

@@ -13,6 +13,7 @@ from overfly.flights import Frame
 from overfly.flights.georeference import by_gps, level_line, on_a_line
 from overfly.geometry import Array, rotation_from_gimbal
 from overfly.mapping.bundle import Bundle, merged
+from overfly.mapping.ties import FEWEST
 
 GPS_SIGMA_M = (0.5, 0.5)
 """Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""
@@ -151,12 +152,28 @@ def far_off(distance: Array) -> NDArray[np.bool_]:
     return np.asarray(distance > max(FAR_OFF_M, 6 * float(np.nanmedian(distance))))
 
 
+def placed_by_others(bundle: Bundle, sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Images [n] whose places images alone tell: the sure ones, and those tied to two of them, one after another.
+
+    Points that an image shares with one other tell in which direction it stands, not how far away: whatever its GPS
+    says, nothing contradicts it.
+    """
+    told, before = sure.copy(), -1
+    while before < told.sum():
+        before = int(told.sum())
+        seen_by = np.bincount(bundle.point[told[bundle.image]], minlength=len(bundle.points))
+        ties = np.bincount(bundle.image[(seen_by >= 2)[bundle.point]], minlength=len(bundle))
+        told |= ties >= FEWEST
+    return told
+
+
 def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warnings: list[str]) -> Array:
     """GPS positions [n, 3] with what is wrong taken out: single positions, single heights, heights of wrong sign."""
     places = places.copy()
     away = bundle.centres - places
     flat = np.linalg.norm(away[:, :2], axis=1)
     wrong = far_off(flat)
+    wrong &= placed_by_others(bundle, ~wrong)
     if wrong.any():
         warnings.append(f"The GPS position of {some_of(wrong, frames)} is far off and was not used.")
     places[wrong] = np.nan
