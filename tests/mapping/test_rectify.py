@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from overfly.geometry import Camera, pose, project, rotation_from_gimbal
+from overfly.geometry import Camera, pose, rotation_from_gimbal
 from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities, right_disparities
-from overfly.mapping.rectify import ordered, rectify
+from overfly.mapping.rectify import Rectified, Relief, ordered, rectify
 
 DIRECTIONS = {
     "along the rows": ((0, 0, 0), (25, 0, 0)),
@@ -31,30 +30,67 @@ def two(direction: str) -> list[np.ndarray]:
     ]
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_matching_points_share_a_row_and_their_disparity_is_their_depth(direction: str, camera: Camera) -> None:
-    poses = two(direction)
+TILTED = {
+    "side by side, tilted": ((0, -60, 0, -50), (40, -60, 0, -50)),
+    "round a place, 60 degrees apart": ((0, -70, 0, -50), (-61, -35, 60, -50)),
+    "one after the other, tilted, other height": ((0, -60, 0, -55), (3, -30, 0, -60)),
+}
+RELIEF = Relief(-6.0, 0.5, 7.0)
+
+
+def looks(name: str) -> list[np.ndarray]:
+    if name in DIRECTIONS:
+        return two(name)
+    return [
+        pose(rotation_from_gimbal(yaw, pitch), [x, y, 80 + 3 * i]) for i, (x, y, yaw, pitch) in enumerate(TILTED[name])
+    ]
+
+
+def laid_out(poses: list[np.ndarray], camera: Camera, relief: Relief | None) -> tuple[list[np.ndarray], Rectified]:
     if not ordered((poses[0], poses[1])):
         poses = poses[::-1]
-    pair = rectify((camera, camera), (poses[0], poses[1]), ((70, 90), (70, 90)))
+    pair = rectify((camera, camera), (poses[0], poses[1]), ((60, 170), (60, 170)), relief)
     assert pair is not None
+    return poses, pair
+
+
+def on_canvas(points: np.ndarray, pair: Rectified, centre: np.ndarray, right: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Places (u, v) of world points and their depth."""
+    local = (points - centre) @ pair.rotation
+    places = local @ (pair.right if right else pair.left).T
+    return places[:, :2] / places[:, 2:], local[:, 2]
+
+
+@pytest.mark.parametrize("relief", [None, RELIEF], ids=["", "sheared"])
+@pytest.mark.parametrize("name", [*DIRECTIONS, *TILTED])
+def test_matching_points_share_a_row_and_their_disparity_is_their_depth(
+    name: str, relief: Relief | None, camera: Camera
+) -> None:
+    poses, pair = laid_out(looks(name), camera, relief)
     points = np.random.default_rng(0).uniform([-15, -15, -4], [25, 20, 4], (50, 3))
-    canvas = Camera(*pair.size, pair.focal, pair.focal, *pair.left_centre)
-    left, depth = project(points, canvas, pose(pair.rotation, poses[0][:3, 3]))
-    right, _ = project(
-        points, replace(canvas, cx=pair.right_centre[0], cy=pair.right_centre[1]), pose(pair.rotation, poses[1][:3, 3])
-    )
+    left, depth = on_canvas(points, pair, poses[0][:3, 3], right=False)
+    right, _ = on_canvas(points, pair, poses[1][:3, 3], right=True)
     np.testing.assert_allclose(left[:, 1], right[:, 1], atol=1e-6)
-    np.testing.assert_allclose(pair.depth(left[:, 0] - right[:, 0]), depth, rtol=1e-6)
+    disparity = left[:, 0] - right[:, 0]
+    assert pair.limits[0] <= disparity.min()
+    assert disparity.max() <= pair.limits[1]
+    np.testing.assert_allclose(pair.depth(disparity, *left.T), depth, rtol=1e-5)
+    np.testing.assert_allclose(pair.depth(disparity, *right.T, right=True), depth, rtol=1e-5)
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_a_matched_pair_gives_the_depth_of_both_frames(direction: str, camera: Camera, hill) -> None:  # type: ignore[no-untyped-def]
-    poses = two(direction)
-    if not ordered((poses[0], poses[1])):
-        poses = poses[::-1]
-    layout = rectify((camera, camera), (poses[0], poses[1]), ((70, 92), (70, 92)))
-    assert layout is not None
+@pytest.mark.parametrize("name", TILTED)
+def test_level_ground_lies_at_the_same_place_of_both_canvases(name: str, camera: Camera) -> None:
+    poses, pair = laid_out(looks(name), camera, RELIEF)
+    ground = np.random.default_rng(0).uniform([-15, -15, RELIEF.ground], [25, 20, RELIEF.ground], (50, 3))
+    left, right = (on_canvas(ground, pair, p[:3, 3], right=bool(k))[0] for k, p in enumerate(poses))
+    assert np.ptp(left[:, 0] - right[:, 0]) < 1e-6
+    _, plain = laid_out(looks(name), camera, None)
+    assert np.ptp(pair.limits) < 0.7 * np.ptp(plain.limits)  # the relief is searched, not the depth of the view
+
+
+@pytest.mark.parametrize("name", [*DIRECTIONS, *TILTED])
+def test_a_matched_pair_gives_the_depth_of_both_frames(name: str, camera: Camera, hill) -> None:  # type: ignore[no-untyped-def]
+    poses, layout = laid_out(looks(name), camera, Relief(-12, 0, 12))
     images = [cv2.cvtColor(hill.render(camera, p), cv2.COLOR_RGB2GRAY) for p in poses]
     left = disparities((images[0], images[1]), (camera, camera), (poses[0], poses[1]), layout)
     ideal = camera.undistorted()
@@ -66,6 +102,35 @@ def test_a_matched_pair_gives_the_depth_of_both_frames(direction: str, camera: C
         gsd = 80 / camera.fx
         assert np.median(np.abs(depth - true)[known]) < 1.0 * gsd
         assert (np.abs(depth - true)[known] < 1.0).mean() > 0.95
+
+
+def test_shearing_finds_more_and_nearer_of_what_two_tilted_frames_see(camera: Camera, hill) -> None:  # type: ignore[no-untyped-def]
+    around = [
+        pose(rotation_from_gimbal((azimuth + 180) % 360, -35), [114 * np.sin(t), 114 * np.cos(t), 80])
+        for azimuth in (180, 255)
+        for t in [np.radians(azimuth)]
+    ]
+    right = []
+    for relief in (None, Relief(-12, 0, 12)):
+        poses, layout = laid_out(around, camera, relief)
+        images = [cv2.cvtColor(hill.render(camera, p), cv2.COLOR_RGB2GRAY) for p in poses]
+        found = disparities((images[0], images[1]), (camera, camera), (poses[0], poses[1]), layout)
+        depth = depth_in_frame(found, camera.undistorted(), poses[0], layout, right=False)
+        true = (hill.surface(camera.undistorted(), poses[0]) - poses[0][:3, 3]) @ poses[0][:3, 2]
+        right.append(float((np.abs(depth - true) < 0.3).mean()))
+    assert right[1] > 2 * right[0]
+
+
+def test_ground_above_a_camera_shears_nothing(camera: Camera) -> None:
+    poses = two("along the rows")
+    plain, pair = (
+        rectify((camera, camera), (poses[0], poses[1]), ((70, 90), (70, 90)), relief)
+        for relief in (None, Relief(80, 90, 95))
+    )
+    assert plain is not None
+    assert pair is not None
+    np.testing.assert_array_equal(pair.right, plain.right)
+    assert pair.limits == plain.limits
 
 
 def test_frames_that_look_along_their_baseline_or_apart_are_refused(camera: Camera) -> None:
@@ -82,8 +147,7 @@ def test_a_wrong_point_close_to_a_camera_makes_no_canvas_without_end(camera: Cam
     pair = rectify((camera, camera), (poses[0], poses[1]), ((0.5, 90), (70, 90)))
     assert pair is not None
     assert pair.size[0] < 4 * camera.width
-    assert pair.disparity(pair.nearest) - pair.disparity(pair.farthest) == pytest.approx(camera.width)
-    assert pair.farthest == pytest.approx(99)
+    assert pair.limits[1] - pair.limits[0] == pytest.approx(camera.width)
 
 
 def test_the_nearest_surface_wins_in_the_right_canvas() -> None:

@@ -198,7 +198,8 @@ def test_depth_ranges_hold_the_points_and_fall_back_to_the_usual(strips, camera,
     depth = (points - strips[0][:3, 3]) @ strips[0][:3, 2]
     assert span.near < depth.min() < span.middle < depth.max() < span.far
     assert span.low < points[:, 2].min()
-    assert unseen == span._replace(low=-np.inf)
+    assert unseen == span._replace(low=-np.inf, high=np.inf)
+    assert span.low < span.ground < points[:, 2].max() < span.high
 
 
 def test_a_camera_of_another_size_is_scaled(hill, strips, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

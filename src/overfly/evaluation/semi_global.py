@@ -12,7 +12,7 @@ from torch import Tensor
 from overfly.geometry import Camera
 from overfly.mapping.consensus import consensus
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
-from overfly.mapping.rectify import ordered, rectify
+from overfly.mapping.rectify import Relief, ordered, rectify
 from overfly.mapping.subpixel import Shot
 from overfly.networks.baselines import interpolated
 from overfly.networks.correlation import LUMA, Heights
@@ -89,7 +89,8 @@ def pair_depth(
         if base < NO_BASE * abs(poses[0][2, 3]):
             continue  # the same frame again
         left, right = (0, other) if ordered((poses[0], poses[other])) else (other, 0)
-        pair = rectify((cameras[left], cameras[right]), (poses[left], poses[right]), (ranges[left], ranges[right]))
+        both = (cameras[left], cameras[right]), (poses[left], poses[right]), (ranges[left], ranges[right])
+        pair = rectify(*both, Relief(height_range[0], 0.0, height_range[1]))
         if pair is None:
             continue
         match = disparities(

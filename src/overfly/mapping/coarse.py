@@ -12,7 +12,7 @@ from overfly.flights import Frame
 from overfly.geometry import Array, Camera, unproject
 from overfly.mapping.depth_ranges import beside_others
 from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities
-from overfly.mapping.rectify import ordered, rectify
+from overfly.mapping.rectify import Relief, ordered, rectify
 
 LONGEST_SIDE = 320
 DRAWN = 200
@@ -34,6 +34,9 @@ AROUND = 64
 OFF = 0.15
 """Share of the cameras' height that those may be off."""
 
+RELIEF = 0.5
+"""The same of how far the surface may rise over the usual ground, or fall below it, in the second look."""
+
 
 def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
     """Points [M, 3] on the surface, some hundred of each of a few dozen pairs, from cameras and images alone.
@@ -43,44 +46,30 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
     Raises:
         InputError: no pair of neighbours shows the same ground.
     """
-    import cv2
-
-    rng = np.random.default_rng(seed)
     centres = np.array([np.asarray(f.world_from_camera)[:3, 3] for f in frames])
-    found, tried = [], set()
+    tried: dict[tuple[int, int], None] = {}
     step = min(max(1, len(frames) // PAIRS), APART)
     for i in range(0, len(frames), step):
         near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")
         for j in [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]:
-            if (min(i, j), max(i, j)) in tried:
-                continue
-            tried.add((min(i, j), max(i, j)))
-            pair = [frames[i], frames[j]]
-            poses = [np.asarray(f.world_from_camera, float) for f in pair]
-            if not ordered((poses[0], poses[1])):
-                pair, poses = pair[::-1], poses[::-1]
-            cameras = [_small(f) for f in pair]
-            baseline = float(np.linalg.norm(poses[0][:3, 3] - poses[1][:3, 3]))
-            reach = cameras[0].fx * baseline / cameras[0].width
-            span = (reach / 0.9, reach / 0.02)
-            layout = rectify((cameras[0], cameras[1]), (poses[0], poses[1]), (span, span))
-            if layout is None:
-                continue
-            gray = [
-                cv2.resize(_gray(f), (c.width, c.height), interpolation=cv2.INTER_AREA) for f, c in zip(pair, cameras)
-            ]
-            match = disparities((gray[0], gray[1]), (cameras[0], cameras[1]), (poses[0], poses[1]), layout)
-            if (match != UNKNOWN).mean() < 0.02:
-                continue
-            ideal = cameras[0].undistorted()
-            depth = depth_in_frame(match, ideal, poses[0], layout, right=False)
-            rows, columns = np.nonzero(np.isfinite(depth))
-            if len(rows) < DRAWN:
-                continue
-            pick = rng.choice(len(rows), DRAWN, replace=False)
-            rows, columns = rows[pick], columns[pick]
-            pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
-            found.append(unproject(pixels, depth[rows, columns], ideal, poses[0]))
+            tried[min(i, j), max(i, j)] = None
+    points = _looked(frames, list(tried), None, centres, seed)
+    # Once the height of the ground is known, tilted pairs match better.
+    ground = float(np.median(points[:, 2]))
+    room = RELIEF * abs(float(np.median(centres[:, 2])) - ground)
+    return _looked(frames, list(tried), Relief(ground - room, ground, ground + room), centres, seed)
+
+
+def _looked(
+    frames: Sequence[Frame], pairs: Sequence[tuple[int, int]], relief: Relief | None, centres: Array, seed: int
+) -> Array:
+    """Points [M, 3] of pairs that other points confirm.
+
+    Raises:
+        InputError: no pair matches.
+    """
+    rng = np.random.default_rng(seed)
+    found = [points for i, j in pairs if (points := _matched(frames[i], frames[j], relief, rng)) is not None]
     if not found:
         raise InputError(
             "No two neighbouring images match with the given cameras: check that the cameras belong to these images, "
@@ -95,6 +84,35 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
     # Of one pair or two: keep what lies among the others.
     away = np.abs(points[:, 2] - np.median(points[:, 2]))
     return points[away <= 6 * np.median(away) + 1e-6]
+
+
+def _matched(first: Frame, second: Frame, relief: Relief | None, rng: np.random.Generator) -> Array | None:
+    """Some points [DRAWN, 3] of two frames, None where too little matches."""
+    import cv2
+
+    pair = [first, second]
+    poses = [np.asarray(f.world_from_camera, float) for f in pair]
+    if not ordered((poses[0], poses[1])):
+        pair, poses = pair[::-1], poses[::-1]
+    cameras = [_small(f) for f in pair]
+    baseline = float(np.linalg.norm(poses[0][:3, 3] - poses[1][:3, 3]))
+    reach = cameras[0].fx * baseline / cameras[0].width
+    span = (reach / 0.9, reach / 0.02)
+    layout = rectify((cameras[0], cameras[1]), (poses[0], poses[1]), (span, span), relief)
+    if layout is None:
+        return None
+    gray = [cv2.resize(_gray(f), (c.width, c.height), interpolation=cv2.INTER_AREA) for f, c in zip(pair, cameras)]
+    match = disparities((gray[0], gray[1]), (cameras[0], cameras[1]), (poses[0], poses[1]), layout)
+    if (match != UNKNOWN).mean() < 0.02:
+        return None
+    ideal = cameras[0].undistorted()
+    depth = depth_in_frame(match, ideal, poses[0], layout, right=False)
+    rows, columns = np.nonzero(np.isfinite(depth))
+    if len(rows) < DRAWN:
+        return None
+    pick = rng.choice(len(rows), DRAWN, replace=False)
+    rows, columns = rows[pick], columns[pick]
+    return unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), depth[rows, columns], ideal, poses[0])
 
 
 def _confirmed(points: Array, pair: NDArray[np.intp], off: float) -> NDArray[np.bool_]:

@@ -26,17 +26,20 @@ how far beyond the others, as a share of the cameras' height, they are left out.
 BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
-UNDER = 0.3, 0.04
-"""Room below the points' heights, as shares of their range and of the median depth: key points are rare in pits."""
+UNDER, OVER = (0.3, 0.04), (0.3, 0.08)
+"""Room below and above the points' heights, as shares of their range and of the median depth: key points are rare in
+pits, on roofs and on tree tops."""
 
 
 class Span(NamedTuple):
-    """Where the surface lies in a frame, with margins, metres: depths along its axis and the lowest z."""
+    """Where the surface lies in a frame, metres: depths along its axis and heights z, the outer ones with margins."""
 
     near: float
     middle: float
     far: float
     low: float
+    ground: float
+    high: float
 
     def floor(self, camera: Camera, world_from_camera: Array) -> NDArray[np.float32]:
         """Depth [H, W] in which each ray of an undistorted frame comes down to the lowest z; infinite if it does not.
@@ -68,9 +71,10 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
         first, middle, last = np.quantile(depth[inside], [rare, 0.5, 1 - rare]).tolist()
         # Roofs and tree tops have few key points: leave room above.
         margin = 0.15 * (last - first) + 0.02 * middle
-        bottom, top = np.quantile(near[inside, 2], [rare, 1 - rare]).tolist()
-        low = bottom - UNDER[0] * (top - bottom) - UNDER[1] * middle
-        found.append(Span(max(first - 1.5 * margin, 0.05 * middle), middle, last + margin, low))
+        bottom, ground, top = np.quantile(near[inside, 2], [rare, 0.5, 1 - rare]).tolist()
+        under, over = (share * (top - bottom) + least * middle for share, least in (UNDER, OVER))
+        low, high = bottom - under, top + over
+        found.append(Span(max(first - 1.5 * margin, 0.05 * middle), middle, last + margin, low, ground, high))
     known = np.flatnonzero([f is not None for f in found])
     if not len(known):
         raise InputError(
@@ -83,7 +87,7 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
         if own is None:
             away = np.linalg.norm(centres[known] - centres[i], axis=1)
             usual = np.median(ranges[np.argsort(away, kind="stable")[:BESIDE]], axis=0).tolist()
-            own = Span(*usual)._replace(low=-np.inf)  # the land may fall there
+            own = Span(*usual)._replace(low=-np.inf, high=np.inf)  # the land may fall or rise there
         settled.append(own)
     return settled
 

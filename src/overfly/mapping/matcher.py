@@ -41,8 +41,8 @@ def disparities(
         u, v = canvas_map(camera, pose, pair, right=bool(right))
         canvases.append(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
         masks.append((u > 0) & (v > 0) & (u < image.shape[1] - 1) & (v < image.shape[0] - 1))
-    low = int(np.floor(pair.disparity(pair.farthest))) - 1
-    span = int(np.ceil((float(pair.disparity(pair.nearest)) + 1 - low) / 16)) * 16
+    low = int(np.floor(pair.limits[0])) - 1
+    span = int(np.ceil((pair.limits[1] + 1 - low) / 16)) * 16
     matcher = cv2.StereoSGBM.create(
         minDisparity=low,
         numDisparities=span,
@@ -102,5 +102,5 @@ def depth_in_frame(
     )
     # A point at depth 1 in rectified axes has depth 1 / (third row of the homography) in camera axes.
     u, v = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
-    third = homography[2, 0] * u + homography[2, 1] * v + homography[2, 2]
-    return (pair.depth(warped) / third).astype(np.float32)
+    x, y, third = ((row[0] * u + row[1] * v + row[2]).astype(np.float32) for row in homography)
+    return (pair.depth(warped, x / third, y / third, right=right) / third).astype(np.float32)

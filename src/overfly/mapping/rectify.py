@@ -3,6 +3,10 @@
 Both cameras are turned about their centres until their x axes lie along the baseline and their z axes are parallel
 (Fusiello, Trucco & Verri 2000, section 3): corresponding points then share a row. The turn is made from the baseline
 itself, so vertical baselines and neighbouring strips flown in opposite directions need no special case.
+
+Then the right canvas is sheared along its rows until level ground lies at the same place in both. Tilted frames see it
+sheared against one another, so that blocks of pixels would not match; and what is left to search is the relief instead
+of the depth of the whole view.
 """
 
 from __future__ import annotations
@@ -16,57 +20,57 @@ from overfly.geometry import Array, Camera, rays
 
 Image = NDArray[np.uint8]
 
+STRETCHED = 0.5, 2.0
+"""How much wider one frame may show the ground than the other along the baseline, or the canvas stays as it is."""
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Heights z in the cameras' frame, metres: the lowest and highest of the surface, and that of usual ground."""
+
+    low: float
+    ground: float
+    high: float
+
 
 @dataclass(frozen=True)
 class Rectified:
     """Two virtual cameras with one rotation and one focal length; ``left`` lies at the smaller x of the baseline.
 
-    A pixel (u, v) of the left canvas and its partner (u - d, v) of the right canvas see the point at depth
-    ``focal * baseline / (d + offset)``.
+    A pixel (u, v) of the left canvas and its partner (u - d, v) of the right canvas see one point.
 
     Attributes:
         rotation: world-from-rectified rotation [3, 3], the same for both.
         focal: pixels.
-        left_centre, right_centre: principal points (u, v) in the two canvases.
         baseline: metres.
+        left, right: calibration matrices [3, 3] of the two canvases; that of the right one shears.
         size: (width, height) of both canvases.
-        nearest, farthest: depth range in metres that the canvas was laid out for.
+        limits: least and most disparity of the surface, pixels.
     """
 
     rotation: Array
     focal: float
-    left_centre: tuple[float, float]
-    right_centre: tuple[float, float]
     baseline: float
+    left: Array
+    right: Array
     size: tuple[int, int]
-    nearest: float
-    farthest: float
+    limits: tuple[float, float]
 
-    @property
-    def offset(self) -> float:
-        """Added to a disparity in canvas pixels it gives focal * baseline / depth."""
-        return self.right_centre[0] - self.left_centre[0]
-
-    def disparity(self, depth: float | Array) -> float | Array:
-        """Canvas disparity of a depth along the rectified z axis."""
-        return self.focal * self.baseline / depth - self.offset
-
-    def depth(self, disparity: NDArray) -> NDArray:
-        """Depth along the rectified z axis; NaN in, NaN out."""
-        return np.float32(self.focal * self.baseline) / (disparity + np.float32(self.offset))
-
-    def matrix(self, right: bool = False) -> Array:
-        """Calibration matrix [3, 3] of one canvas."""
-        u, v = self.right_centre if right else self.left_centre
-        return np.array([[self.focal, 0, u], [0, self.focal, v], [0, 0, 1.0]])
+    def depth(self, disparity: NDArray, u: NDArray, v: NDArray, *, right: bool = False) -> NDArray:
+        """Depth along the rectified z axis of the pixels (u, v) of a canvas; NaN in, NaN out."""
+        start = u + disparity if right else u
+        (focal, _, u0), (stretch, shear, offset) = (matrix[0].astype(np.float32) for matrix in (self.left, self.right))
+        y = (v - np.float32(self.left[1, 2])) / focal
+        # Where each of the two sees the point in the plane z = 1.
+        x, partner = (start - u0) / focal, (start - disparity - shear * y - offset) / stretch
+        return np.asarray(np.float32(self.baseline) / (x - partner))
 
 
 def rectify(
     cameras: tuple[Camera, Camera],
     poses: tuple[Array, Array],
     ranges: tuple[tuple[float, float], tuple[float, float]],
-    *,
-    scale: float = 1.0,
+    relief: Relief | None = None,
 ) -> Rectified | None:
     """Lay out the two canvases so that they hold the overlap and nothing else.
 
@@ -74,7 +78,7 @@ def rectify(
         cameras: of the two frames; the one at the smaller x of the common frame must come first (see :func:`ordered`).
         poses: world_from_camera [4, 4].
         ranges: (nearest, farthest) depth in each frame, metres.
-        scale: size of canvas pixels: 0.5 halves the resolution.
+        relief: of the surface; without it the right canvas is not sheared, and heights do not limit disparities.
 
     Returns:
         None where the frames look along their baseline, or do not overlap.
@@ -91,34 +95,67 @@ def rectify(
         return None
     z /= np.linalg.norm(z)
     rotation = np.stack([x, np.cross(z, x), z], axis=1)
-    focal = scale * (cam_l.fx + cam_l.fy + cam_r.fx + cam_r.fy) / 4
-    boxes = [_box(c, rotation.T @ p[:3, :3]) for c, p in zip(cameras, poses)]
-    if boxes[0] is None or boxes[1] is None:
+    left, right = (_border(c, rotation.T @ p[:3, :3]) for c, p in zip(cameras, poses))
+    if left is None or right is None:
         return None
+    parallax = _of_ground(rotation, baseline, (pose_l[2, 3], pose_r[2, 3]), relief)
+    sheared = np.array([1, parallax[1], parallax[2]]) / (1 - parallax[0])
+    right[:, 0] = right @ sheared
+    # All along the plane z = 1 from here to the canvases; the ground's disparity is zero.
     nearest = max(min(ranges[0][0], ranges[1][0]) * 0.9, 1e-6)
     farthest = max(ranges[0][1], ranges[1][1]) * 1.1
-    most, least = focal * baseline / nearest, focal * baseline / farthest
+    reach = baseline / farthest, baseline / nearest
+    known = relief if parallax.any() else None
+    limits = [
+        _limits(border @ parallax, pose[2, 3], reach, known) * stretch
+        for border, pose, stretch in ((left, pose_l, sheared[0]), (right, pose_r, 1.0))
+    ]
+    focal = (cam_l.fx + cam_l.fy + cam_r.fx + cam_r.fy) / 4
+    least, most = focal * max(low for low, _ in limits), focal * min(high for _, high in limits)
     # Single wrong points close to a camera ask for disparities without end; nothing matches over a whole image.
-    most = min(most, least + max(cam_l.width, cam_r.width))
-    nearest = focal * baseline / most
-    (l0, l1), (r0, r1) = boxes[0][0] * focal, boxes[1][0] * focal
-    top, bottom = (f(boxes[0][1][i], boxes[1][1][i]) * focal for f, i in ((max, 0), (min, 1)))
+    widest = max(cam_l.width, cam_r.width)
+    least = least if known is None else max(least, -widest / 2)
+    most = min(most, least + widest)
+    (l0, top_l), (r0, top_r) = (border[:, :2].min(0) * focal for border in (left, right))
+    (l1, bottom_l), (r1, bottom_r) = (border[:, :2].max(0) * focal for border in (left, right))
     pad = (most - least) / 2 + 8
     start, stop = max(l0, r0 + least) - pad, min(l1, r1 + most) + pad
+    top, bottom = max(top_l, top_r), min(bottom_l, bottom_r)
     width, height = int(np.ceil(stop - start)), int(np.ceil(bottom - top))
-    if width < 32 + 2 * pad or height < 32:
+    if most <= least or width < 32 + 2 * pad or height < 32:
         return None
-    middle = np.round((most + least) / 2)
-    return Rectified(
-        rotation,
-        focal,
-        (-start, -top),
-        (-start + middle, -top),
-        baseline,
-        (width, height),
-        nearest,
-        farthest,
-    )
+    middle = float(np.round((most + least) / 2))
+    matrix = np.array([[focal, 0, -start], [0, focal, -top], [0, 0, 1.0]])
+    other = matrix.copy()
+    other[0] = focal * sheared + [0, 0, middle - start]
+    return Rectified(rotation, focal, baseline, matrix, other, (width, height), (least - middle, most - middle))
+
+
+def _of_ground(rotation: Array, baseline: float, heights: tuple[float, float], relief: Relief | None) -> Array:
+    """Parallax of level ground in the plane z = 1: at a place (x, y) of the left frame (x, y, 1) times this; [3]."""
+    if relief is None or relief.ground >= min(heights):
+        return np.zeros(3)
+    found: Array = baseline * rotation[2] / (relief.ground - heights[0])
+    return found if STRETCHED[0] < 1 - found[0] < STRETCHED[1] else np.zeros(3)
+
+
+def _limits(ground: Array, height: float, reach: tuple[float, float], relief: Relief | None) -> Array:
+    """Least and most of what parallaxes are above the ground's [N] along rays of a camera at a height z; [2].
+
+    Args:
+        reach: least and most parallax of all rays.
+    """
+    if relief is None:
+        return np.array(reach)
+    # Rays that come down beyond the farthest depth see nothing that may be matched.
+    ground = ground[ground > reach[0]]
+    if not len(ground):
+        return np.zeros(2)
+    over = height - relief.ground
+    lowest = ground * over / (height - relief.low)
+    highest = ground * over / (height - relief.high) if relief.high < height else np.inf
+    least, most = np.maximum(lowest, reach[0]), np.minimum(highest, reach[1])
+    return np.array([(least - ground).min(), (most - ground).max()])
 
 
 def ordered(poses: tuple[Array, Array]) -> bool:
@@ -130,16 +167,15 @@ def ordered(poses: tuple[Array, Array]) -> bool:
     return bool(right @ (poses[1][:3, 3] - poses[0][:3, 3]) >= 0)
 
 
-def _box(camera: Camera, rectified_from_camera: Array) -> Array | None:
-    """Bounds of an image in the rectified plane z = 1: [[x0, x1], [y0, y1]], None if part of it is behind."""
+def _border(camera: Camera, rectified_from_camera: Array) -> Array | None:
+    """Points (x, y, 1) [N, 3] along an image's border in the rectified plane, None if part of it is behind."""
     t = np.linspace(0, 1, 9)
     edge = np.concatenate([np.stack([t, 0 * t], 1), np.stack([t, 0 * t + 1], 1), np.stack([0 * t, t], 1)])
     edge = np.concatenate([edge, np.stack([0 * t + 1, t], 1)]) * [camera.width, camera.height]
     local = rays(edge, camera) @ rectified_from_camera.T
     if local[:, 2].min() < 0.2 * np.linalg.norm(local, axis=1).max():
         return None
-    flat = local[:, :2] / local[:, 2:]
-    return np.stack([flat.min(0), flat.max(0)], axis=1)
+    return np.asarray(local / local[:, 2:])
 
 
 def canvas_map(camera: Camera, world_from_camera: Array, pair: Rectified, *, right: bool) -> tuple[NDArray, NDArray]:
@@ -147,7 +183,7 @@ def canvas_map(camera: Camera, world_from_camera: Array, pair: Rectified, *, rig
     import cv2
 
     turn = pair.rotation.T @ world_from_camera[:3, :3]
-    matrix, canvas = camera.matrix(), pair.matrix(right)
+    matrix, canvas = camera.matrix(), (pair.right if right else pair.left).copy()
     # cv2 counts pixel centres from 0, this project from 0.5.
     matrix[:2, 2] -= 0.5
     canvas[:2, 2] -= 0.5
@@ -157,4 +193,5 @@ def canvas_map(camera: Camera, world_from_camera: Array, pair: Rectified, *, rig
 
 def from_canvas(camera: Camera, world_from_camera: Array, pair: Rectified, *, right: bool) -> Array:
     """Homography [3, 3] that takes pixels of the undistorted frame to canvas pixels (both in this project's pixels)."""
-    return pair.matrix(right) @ pair.rotation.T @ world_from_camera[:3, :3] @ np.linalg.inv(camera.matrix())
+    canvas = pair.right if right else pair.left
+    return np.asarray(canvas @ pair.rotation.T @ world_from_camera[:3, :3] @ np.linalg.inv(camera.matrix()))

@@ -27,7 +27,7 @@ from overfly.mapping.depth_ranges import Span, depth_ranges
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.needs import SIZE
 from overfly.mapping.neighbours import choose_partners
-from overfly.mapping.rectify import Rectified, ordered, rectify
+from overfly.mapping.rectify import Rectified, Relief, ordered, rectify
 from overfly.mapping.subpixel import refine
 from overfly.mapping.threads import in_threads
 from overfly.mapping.views import Views
@@ -179,10 +179,12 @@ def _pair_file(workdir: Path, pair: tuple[int, int]) -> Path:
 def _layout(flight: Views, pair: tuple[int, int], ranges: list[Span]) -> tuple[int, int, Rectified | None]:
     """Left frame, right frame and their rectification, None where it is not possible."""
     i, j = pair if ordered((flight.poses[pair[0]], flight.poses[pair[1]])) else pair[::-1]
+    here, there = ranges[i], ranges[j]
     layout = rectify(
         (flight.matched_lens[i], flight.matched_lens[j]),
         (flight.poses[i], flight.poses[j]),
-        ((ranges[i].near, ranges[i].far), (ranges[j].near, ranges[j].far)),
+        ((here.near, here.far), (there.near, there.far)),
+        Relief(min(here.low, there.low), (here.ground + there.ground) / 2, max(here.high, there.high)),
     )
     return i, j, layout
 
