@@ -115,6 +115,29 @@ def test_a_pair_alone_must_correlate_better_where_more_partners_see_the_place(
     assert len(cloud) == (camera.width * camera.height if kept else 0)
 
 
+@pytest.mark.parametrize(("sideways", "kept"), [(5.0, False), (70.0, True)])
+def test_wide_partners_that_have_not_matched_a_place_do_not_speak_against_it(
+    camera: Camera, sideways: float, kept: bool, tmp_path: Path
+) -> None:
+    """They look at it from another side: something may hide it."""
+    shape = camera.height, camera.width
+    blank = {"sigma": np.full(shape, 0.1, np.float32), "support": np.ones(shape, np.uint8)}
+    data = blank | {"depth": np.full(shape, 50, np.float32), "score": np.full(shape, 0.35, np.float32)}
+    empty = blank | {"depth": np.full(shape, np.nan, np.float32)}
+    turned = np.arctan2(sideways, 50)
+    aside = np.eye(4)
+    aside[:3, :3] = [[np.cos(turned), 0, -np.sin(turned)], [0, 1, 0], [np.sin(turned), 0, np.cos(turned)]]
+    aside[0, 3] = sideways
+    own, other = (DepthMap(name, camera, np.eye(4), [], tmp_path / f"{name}.npz") for name in ("a", "b"))
+    further = DepthMap("c", camera, aside, [], tmp_path / "c.npz")
+    frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
+    Image.fromarray(np.full((*shape, 3), 200, np.uint8)).save(frame.path)
+    near = [(other, data, None), (further, empty, None)]
+    cloud, *_ = frame_points(own, data, near, frame, single=True)
+    middle = np.abs(cloud.points[:, :2]).max(axis=1) < 2  # which both have inside
+    assert bool(middle.any()) == kept
+
+
 @pytest.mark.parametrize(("others", "kept"), [(0, True), (1, False)])
 def test_a_wall_that_two_frames_alone_see_stands_though_its_depth_changes_from_pixel_to_pixel(
     camera: Camera, others: int, kept: bool, tmp_path: Path

@@ -14,7 +14,7 @@ from overfly.geometry import Camera, invert, pose, rotation_from_gimbal, unproje
 from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.fuse import fuse
-from overfly.mapping.neighbours import choose_partners
+from overfly.mapping.neighbours import choose_partners, is_wide
 from overfly.mapping.stereo import BASE_TO_HEIGHT, stereo
 from overfly.mapping.subpixel import Shot, frame_to_frame, refine
 
@@ -188,6 +188,22 @@ def test_views_that_differ_much_are_partners_where_there_are_no_better_ones(came
     between = pose(rotation_from_gimbal(210.0, -55.0), [125 * np.sin(angles[1] / 2), 125 * np.cos(angles[1] / 2), 90])
     better = choose_partners([lens] * 7, [*ring, between], [110.0] * 7, count=4, ratio=BASE_TO_HEIGHT)
     assert better[0][0] == better[1][0] == 6
+
+
+def test_wide_partners_come_besides_those_that_already_show_the_ground(camera) -> None:  # type: ignore[no-untyped-def]
+    """Eighteen images round a place: four neighbours show all of the ground, and houses hide some of it from them."""
+    angles = np.radians(20.0 * np.arange(18))
+    ring = [
+        pose(rotation_from_gimbal(float(np.degrees(a)) + 180, -55.0), [63 * np.sin(a), 63 * np.cos(a), 90])
+        for a in angles
+    ]
+    lens = replace(camera, fx=0.9 * camera.width, fy=0.9 * camera.width)
+    found = choose_partners([lens] * 18, ring, [110.0] * 18, count=2, ratio=BASE_TO_HEIGHT)
+    for i, partners in enumerate(found):
+        apart = [min((j - i) % 18, (i - j) % 18) for j in partners]
+        assert max(apart[:2]) <= 4
+        assert len(partners) > 2
+        assert all(is_wide(lens, ring[i], 110.0, ring[j]) for j in partners[2:])
 
 
 def test_depth_ranges_hold_the_points_and_fall_back_to_the_usual(strips, camera, hill) -> None:  # type: ignore[no-untyped-def]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, unproject
+from overfly.mapping.depth_map import OBLIQUE_DEG
 from overfly.mapping.depth_ranges import beside_others
 from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities
 from overfly.mapping.rectify import Relief, ordered, rectify
@@ -34,8 +35,9 @@ AROUND = 64
 OFF = 0.15
 """Share of the cameras' height that those may be off."""
 
-RELIEF = 0.5
-"""The same of how far the surface may rise over the usual ground, or fall below it, in the second look."""
+RELIEF, WITHIN = 0.5, 0.9
+"""The same of how far the surface may rise over the usual ground, or fall below it, in the second look; the part of it
+within which points are kept: what matches nowhere comes to lie at the ends."""
 
 
 def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
@@ -54,10 +56,14 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
         for j in [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]:
             tried[min(i, j), max(i, j)] = None
     points = _looked(frames, list(tried), None, centres, seed)
+    down = np.array([np.asarray(f.world_from_camera)[2, 2] for f in frames])
+    if (down <= -np.cos(np.deg2rad(OBLIQUE_DEG))).all():
+        return points
     # Once the height of the ground is known, tilted pairs match better.
     ground = float(np.median(points[:, 2]))
     room = RELIEF * abs(float(np.median(centres[:, 2])) - ground)
-    return _looked(frames, list(tried), Relief(ground - room, ground, ground + room), centres, seed)
+    again = _looked(frames, list(tried), Relief(ground - room, ground, ground + room), centres, seed)
+    return again[np.abs(again[:, 2] - ground) < WITHIN * room]
 
 
 def _looked(

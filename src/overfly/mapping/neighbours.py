@@ -14,9 +14,10 @@ GRID = 8
 CANDIDATES = 40
 """Nearest cameras that are looked at."""
 
-WIDE = 0.9
+WIDE, FURTHER = 0.9, 4
 """Base-to-height ratio beyond which a pair counts only for ground that no better one has, as on circles with an image
-every 60 degrees."""
+every 60 degrees; and how many such partners a frame may have besides: they see past what hides a place from others (on
+circles over blocks 0.41 of the level ground that two images see was missing, 0.81 of it where these were no pair)."""
 
 REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
 """What seeing a place once more is worth: the first partner makes it measured, the later ones make it sure."""
@@ -35,7 +36,7 @@ def choose_partners(
     Args:
         cameras, poses: of n frames; lenses are taken as undistorted.
         depths: median depth of each frame's ground, metres.
-        count: most partners of a frame.
+        count: most partners of a frame, but for :data:`FURTHER` wide ones.
         ratio: smallest and largest base-to-height ratio.
 
     Returns:
@@ -72,29 +73,41 @@ def _partners(
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = local[..., 0] / local[..., 2] * fx + cx, local[..., 1] / local[..., 2] * fy + cy
         inside = (local[..., 2] > 0) & (u > 0) & (u < width) & (v > 0) & (v < height)
-    here = ground - centres[i]
-    lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=2)
-    cosine = np.einsum("gk,jgk->jg", here, there) / np.maximum(lengths, 1e-12)
-    base_to_height = 2 * np.tan(np.arccos(np.clip(cosine, -1, 1)) / 2)
-    values = np.where(inside, _value(base_to_height, ratio), 0.0)
-    wide = {int(j): far for j, far in zip(near, base_to_height > WIDE, strict=True)}
+    ratios = base_to_height(ground - centres[i], there)
+    values = np.where(inside, _value(ratios, ratio), 0.0)
+    wide = {int(j): far for j, far in zip(near, ratios > WIDE, strict=True)}
     worth = {int(j): value for j, value in zip(near, values, strict=True) if value.mean() > 0.02}
     chosen: list[int] = []
     times = np.zeros(len(ground), int)
-    while worth and len(chosen) < count:
-        repeat = np.array([REPEATS[min(t, len(REPEATS) - 1)] for t in times])
-        gains = {j: float((value * repeat * (~wide[j] | (times == 0))).mean()) for j, value in worth.items()}
-        best = max(gains, key=lambda j: (gains[j], -j))
-        if gains[best] < 0.02:
-            break
-        chosen.append(best)
-        times += worth.pop(best) > 0
+    for most, wide_only in ((count, False), (count + FURTHER, True)):
+        while worth and len(chosen) < most:
+            repeat = np.array([REPEATS[min(t, len(REPEATS) - 1)] for t in times])
+            counts = {j: wide[j] if wide_only else ~wide[j] | (times == 0) for j in worth}
+            gains = {j: float((value * repeat * counts[j]).mean()) for j, value in worth.items()}
+            best = max(gains, key=lambda j: (gains[j], -j))
+            if gains[best] < 0.02:
+                break
+            chosen.append(best)
+            times += worth.pop(best) > 0
     return chosen
 
 
-def _value(base_to_height: Array, ratio: tuple[float, float]) -> Array:
-    """1 between 0.15 and 0.45; less where depth is imprecise (narrow) or views differ too much (wide)."""
-    low, high = ratio
-    rise = (base_to_height - low) / max(0.15 - low, 1e-9)
-    fall = np.interp(base_to_height, [0.45, WIDE, max(high, WIDE)], [1, 0.3, 0])
-    return np.where((base_to_height > low) & (base_to_height < high), np.clip(np.minimum(rise, fall), 0, 1), 0.0)
+def base_to_height(here: Array, there: Array) -> Array:
+    """Base-to-height ratio of two lines of sight [..., 3] to one place, as of two cameras level with each other."""
+    lengths = np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
+    cosine = (here * there).sum(-1) / np.maximum(lengths, 1e-12)
+    return np.asarray(2 * np.tan(np.arccos(np.clip(cosine, -1, 1)) / 2))
+
+
+def is_wide(camera: Camera, world_from_camera: Array, depth: float, other: Array) -> bool:
+    """Whether a frame and another one, whose pose is given, make a wide pair at a depth in the middle of the first."""
+    middle = unproject(np.array([[camera.cx, camera.cy]]), np.array([depth]), camera, world_from_camera)[0]
+    return bool(base_to_height(middle - world_from_camera[:3, 3], middle - other[:3, 3]) > WIDE)
+
+
+def _value(ratios: Array, limits: tuple[float, float]) -> Array:
+    """1 between 0.15 and 0.45; less where depth is imprecise (narrow) or views differ much (wide)."""
+    low, high = limits
+    rise = (ratios - low) / max(0.15 - low, 1e-9)
+    fall = np.interp(ratios, [0.45, WIDE, max(high, WIDE)], [1, 0.3, 0.1])
+    return np.where((ratios > low) & (ratios < high), np.clip(np.minimum(rise, fall), 0, 1), 0.0)

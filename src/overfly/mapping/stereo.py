@@ -36,7 +36,7 @@ Opinions = Callable[[int, list[int], Array], Opinion | None]
 """What a network says of a frame, given its partners and surface points [M, 3] that its pairs have measured."""
 
 Progress = Callable[[int, int], None]
-BASE_TO_HEIGHT = (0.04, 1.4)
+BASE_TO_HEIGHT = (0.04, 2.0)
 DISPARITY_SIGMA = 0.4
 """Standard deviation of a semi-global disparity, pixels of the matched size."""
 
@@ -45,6 +45,9 @@ REFINED_SIGMA = 0.25
 
 SURE = 0.6
 """Correlation from which on a refined depth is taken for measured before any other frame confirms it."""
+
+ASKED = 4
+"""Partners with which a network compares a frame, at most: it was trained with as many."""
 
 AHEAD = 2
 """Frames that are begun for each worker before the first of them is finished."""
@@ -69,7 +72,7 @@ def stereo(
         workdir: parts and results are kept here; give one folder per set of cameras and settings.
         points: sparse surface points [M, 3], for the depth ranges; None takes a coarse look first.
         max_size: longest side of the depth maps, pixels.
-        neighbours: most partners of a frame.
+        neighbours: most partners of a frame, but for wide ones (:mod:`overfly.mapping.neighbours`).
         seed: of the coarse look's sample.
         opinions: a network's say in each frame's depth, made from the views and the surface points [M, 3].
         workers: frames that are worked on side by side; what comes out does not depend on it.
@@ -107,9 +110,10 @@ def stereo(
     def measure(i: int, ready: Sequence[Future[None]]) -> None:
         for one in ready:  # they were asked for before, so that somebody is at them or has done them
             one.result()
-        # Pairs of this frame; correlate with every frame that took part, the chosen ones first.
+        # Correlate with frames that took part, the chosen ones first.
         chosen = partners[i] + [j for j in _all(waiting[i], i) if j not in partners[i]]
-        _depth(flight, i, waiting[i], chosen[:neighbours], ranges, workdir, _depth_file(workdir, i), ask)
+        chosen = chosen[: max(neighbours, len(partners[i]))]
+        _depth(flight, i, waiting[i], chosen, ranges, workdir, _depth_file(workdir, i), ask)
 
     asked = [i for i in range(len(frames)) if waiting[i]]
     with in_threads(workers) as pool:
@@ -260,7 +264,7 @@ def _depth(
         depth, support = np.full(shape, np.nan, np.float32), np.zeros(shape, np.uint8)
     full = _at_full_size(flight, i, chosen, depth, support)
     paired = np.isfinite(full["depth"])
-    opinion = None if ask is None else ask(i, chosen, _sample(depth, small, flight.poses[i]))
+    opinion = None if ask is None else ask(i, chosen[:ASKED], _sample(depth, small, flight.poses[i]))
     if opinion is not None:
         # It has no vote where pairs were matched: with its wide sigma it would agree with wrong matches, too. A veto it
         # has, when maps are compared.
