@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -34,7 +36,25 @@ def test_a_surface_that_is_half_a_pixel_off_comes_nearer() -> None:
     assert after[moved].median() < 0.5 * before[moved].median()
     assert after.mean() < before.mean()
     assert torch.equal(better.points, on_grid(better.height, batch, 256))
-    assert better.confidence is off.confidence
+    assert better.confidence is not None
+    assert off.confidence is not None
+    assert torch.equal(better.confidence, off.confidence)
+
+
+def test_what_the_reference_alone_sees_is_laid_on_what_is_measured_around_it() -> None:
+    batch, true = windows()
+    once = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
+    once[..., :24] = True
+    lifted = true + torch.where(once, 0.3, 0.002)  # the network knows what stands there, not how high the ground is
+    views = torch.where(once, 1.0, 3.0)
+    answer = replace(said(batch, lifted, sigma=0.02), views=views, alone=lifted)
+    better = paired(answer, batch)
+    assert (better.height - true).abs()[once].median() < 0.3 * (lifted - true).abs()[once].median()
+    assert torch.equal(better.height[~once], paired(replace(answer, alone=None), batch).height[~once])
+    assert better.sigma is not None
+    assert answer.sigma is not None
+    assert (better.sigma != answer.sigma)[once].all()
+    assert torch.equal(better.sigma[~once], answer.sigma[~once])
 
 
 def test_pairs_are_not_believed_far_from_what_the_network_is_sure_of() -> None:

@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from overfly.errors import InputError
 from overfly.evaluation.semi_global import semi_global
+from overfly.mapping.sweep import PER_FRAME
 from overfly.networks.baselines import NearestWindow, interpolated, lifted, mean_heights
 from overfly.networks.blocks import grid_side
 from overfly.networks.correlation import Heights, correlation_sweep
@@ -38,6 +39,8 @@ class Answer:
         confidence: probability that the height is right [B, H, W]; None if the method does not say.
         right_within: the error up to which a height is right.
         measured: pixels that were measured and not filled in [B, H, W]; None if the method does not say.
+        views: frames that have the place inside, the reference included [B, H, W]; None if the method does not say.
+        alone: height that the reference image suggests without the others [B, H, W]; None if the method does not say.
     """
 
     points: Tensor
@@ -46,6 +49,8 @@ class Answer:
     confidence: Tensor | None = None
     right_within: float = 0.0
     measured: Tensor | None = None
+    views: Tensor | None = None
+    alone: Tensor | None = None
 
 
 class Baselines:
@@ -120,7 +125,12 @@ class Network:
         if "height" not in output:
             return _of_cloud(output["points"], batch)
         maps = {name: _enlarged(output[name], (height, width)) for name in ("height", "sigma", "confidence")}
-        return Answer(output["points"], **maps, right_within=RIGHT_PX * 2 / output["height"].shape[2])
+        within = RIGHT_PX * 2 / output["height"].shape[2]
+        views = F.interpolate(output["views"][:, None].float(), (height, width), mode="nearest")[:, 0]
+        alone = self.network(self.sized({**batch, **{name: batch[name][:, :1] for name in PER_FRAME}}))["height"]
+        return Answer(
+            output["points"], **maps, right_within=within, views=views, alone=_enlarged(alone, (height, width))
+        )
 
     @torch.no_grad()
     def encode(self, batch: Batch) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -131,8 +141,7 @@ class Network:
 
     def describe(self, batch: Batch) -> dict[str, Tensor]:
         """``descriptor`` [B, 1, D] of the reference frames, the other frames left aside."""
-        names = ("images", "intrinsics", "camera_from_window", "prior_from_window")
-        return self.encode({name: batch[name][:, :1] for name in names})[0]
+        return self.encode({name: batch[name][:, :1] for name in PER_FRAME})[0]
 
     def sized(self, batch: Batch) -> dict[str, Tensor]:
         """The windows at the image size that the network was trained with.

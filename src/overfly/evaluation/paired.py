@@ -11,8 +11,9 @@ from torch import Tensor
 
 from overfly.evaluation.answers import Answer, on_grid
 from overfly.evaluation.semi_global import one_window, pair_depth, rise, shots
-from overfly.mapping.depth_map import contradicted
+from overfly.mapping.depth_map import Opinion, contradicted
 from overfly.mapping.frame_points import WORST_SCORE
+from overfly.mapping.stereo import SURE
 from overfly.mapping.subpixel import refine
 
 PAIR_STEPS, NETWORK_STEPS = (-1, -0.5, 0, 0.5, 1), (-2, -1, 0, 1, 2)
@@ -24,7 +25,8 @@ def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
 
     Much as :mod:`overfly.mapping.stereo` and :func:`overfly.mapping.frame_points.cleaned` do it for one frame: where
     pairs have matched and all frames correlate there, their refined depth stands unless the network contradicts it;
-    else the network's does, refined where it correlates. Sigma and confidence stay those of the network.
+    else the network's does, refined where it correlates. What the reference image alone sees is laid on what was
+    measured around it (:mod:`overfly.mapping.anchor`), with its sigma and confidence; the others stay the network's.
 
     Args:
         answer: of the network.
@@ -32,7 +34,7 @@ def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
     """
     assert answer.sigma is not None
     assert answer.confidence is not None
-    heights = []
+    heights, sigmas, confidences = [], [], []
     for number in range(len(answer.height)):
         window = one_window(batch, number)
         frames = shots(window)
@@ -49,7 +51,23 @@ def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
             stands = (found.score >= WORST_SCORE[False]) & (better >= low) & (better <= high)
             if depth is matched:
                 stands &= ~contradicted(better - said, support, sigma, sure)
+                measured = np.where(stands & (found.score >= SURE), found.depth, np.float32(np.nan))
             height[stands] = better[stands]
+        if answer.views is not None and answer.alone is not None:
+            once = answer.views[number].cpu().numpy() < 2
+            alone = answer.alone[number].double().cpu().numpy()
+            depths, spread = ((x / slope).astype(np.float32) for x in (np.stack([said, alone]) - base, sigma))
+            word = Opinion(depths[0], np.abs(spread), sure.astype(np.float32), 2 - once.astype(np.uint8), depths[1])
+            settled = word.settled(measured, frames[0].camera, frames[0].world_from_camera)
+            told = once & np.isfinite(settled.depth)
+            height[told] = np.clip(settled.depth * slope + base, low, high)[told]
+            sigma = np.where(told, settled.sigma * np.abs(slope), sigma)
+            sure = np.where(told, settled.confidence, sure)
         heights.append(height)
-    surface = torch.from_numpy(np.stack(heights)).to(answer.height)
-    return replace(answer, points=on_grid(surface, batch, answer.points.shape[1]), height=surface)
+        sigmas.append(sigma)
+        confidences.append(sure)
+    surface, spreads, sure_of = (
+        torch.from_numpy(np.stack(maps)).to(answer.height) for maps in (heights, sigmas, confidences)
+    )
+    points = on_grid(surface, batch, answer.points.shape[1])
+    return replace(answer, points=points, height=surface, sigma=spreads, confidence=sure_of)
