@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from overfly.geometry import Camera, pixel_grid, pose, rotation_from_gimbal, unproject
-from overfly.mapping.coarse import _confirmed
+from overfly.mapping.coarse import _confirmed, coarse_points
 from overfly.mapping.depth_ranges import beside_others, depth_ranges
 
 
@@ -22,6 +24,21 @@ def test_an_oblique_frame_does_not_see_far_under_the_ground_before_it() -> None:
     assert np.isnan(kept[40:]).all()  # the lower rows look at ground that is near
     assert np.isfinite(kept[z > -1]).all()
     assert np.isnan(kept[z < -40]).all()
+
+
+def test_a_first_look_at_oblique_images_finds_the_ground(camera: Camera, hill, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    around = [
+        pose(rotation_from_gimbal(float(azimuth) + 180, -40), [95 * np.sin(t), 95 * np.cos(t), 80])
+        for azimuth in range(0, 360, 45)
+        for t in [np.radians(azimuth)]
+    ]
+    frames = hill.frames(tmp_path, camera, around, known=True)
+    points = coarse_points(frames, seed=0)
+    off = np.abs(points[:, 2] - hill.height(points[:, :2]))
+    assert len(points) > 400
+    assert np.median(off) < 0.5
+    assert (off < 3).mean() > 0.9
+    np.testing.assert_array_equal(points, coarse_points(frames, seed=0))
 
 
 def test_points_of_a_pair_that_other_pairs_contradict_are_left_out() -> None:

@@ -115,15 +115,17 @@ def test_a_pair_alone_must_correlate_better_where_more_partners_see_the_place(
     assert len(cloud) == (camera.width * camera.height if kept else 0)
 
 
-@pytest.mark.parametrize(("sideways", "kept"), [(5.0, False), (70.0, True)])
-def test_wide_partners_that_have_not_matched_a_place_do_not_speak_against_it(
-    camera: Camera, sideways: float, kept: bool, tmp_path: Path
+@pytest.mark.parametrize(
+    ("sideways", "there", "kept"),
+    [(5.0, np.nan, False), (70.0, np.nan, True), (70.0, 40.0, True), (5.0, 40.0, False), (70.0, 300.0, False)],
+)
+def test_wide_partners_speak_against_a_place_only_where_they_see_through_it(
+    camera: Camera, sideways: float, there: float, kept: bool, tmp_path: Path
 ) -> None:
-    """They look at it from another side: something may hide it."""
+    """They look at it from another side: something nearer may hide it, and often they match nothing."""
     shape = camera.height, camera.width
     blank = {"sigma": np.full(shape, 0.1, np.float32), "support": np.ones(shape, np.uint8)}
     data = blank | {"depth": np.full(shape, 50, np.float32), "score": np.full(shape, 0.35, np.float32)}
-    empty = blank | {"depth": np.full(shape, np.nan, np.float32)}
     turned = np.arctan2(sideways, 50)
     aside = np.eye(4)
     aside[:3, :3] = [[np.cos(turned), 0, -np.sin(turned)], [0, 1, 0], [np.sin(turned), 0, np.cos(turned)]]
@@ -132,7 +134,7 @@ def test_wide_partners_that_have_not_matched_a_place_do_not_speak_against_it(
     further = DepthMap("c", camera, aside, [], tmp_path / "c.npz")
     frame = Frame("a", tmp_path / "a.png", camera.width, camera.height, camera=camera)
     Image.fromarray(np.full((*shape, 3), 200, np.uint8)).save(frame.path)
-    near = [(other, data, None), (further, empty, None)]
+    near = [(other, data, None), (further, blank | {"depth": np.full(shape, there, np.float32)}, None)]
     cloud, *_ = frame_points(own, data, near, frame, single=True)
     middle = np.abs(cloud.points[:, :2]).max(axis=1) < 2  # which both have inside
     assert bool(middle.any()) == kept

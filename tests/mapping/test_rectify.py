@@ -121,16 +121,40 @@ def test_shearing_finds_more_and_nearer_of_what_two_tilted_frames_see(camera: Ca
     assert right[1] > 2 * right[0]
 
 
-def test_ground_above_a_camera_shears_nothing(camera: Camera) -> None:
-    poses = two("along the rows")
+@pytest.mark.parametrize("ground", [9.0, 9.99, 10.0, 12.0])
+def test_ground_as_high_as_the_cameras_shears_nothing(ground: float, camera: Camera) -> None:
+    """Before a facade the usual height of the surface may be that of the cameras."""
+    ahead = pose(rotation_from_gimbal(0, 0), [0, 0, 10]), pose(rotation_from_gimbal(0, 0), [8, 0, 10])
     plain, pair = (
-        rectify((camera, camera), (poses[0], poses[1]), ((70, 90), (70, 90)), relief)
-        for relief in (None, Relief(80, 90, 95))
+        rectify((camera, camera), ahead, ((35, 45), (35, 45)), relief) for relief in (None, Relief(-2, ground, 24))
     )
     assert plain is not None
     assert pair is not None
     np.testing.assert_array_equal(pair.right, plain.right)
     assert pair.limits == plain.limits
+
+
+def test_heights_may_be_unknown(camera: Camera) -> None:
+    poses = looks("round a place, 60 degrees apart")
+    _, pair = laid_out(poses, camera, Relief(-np.inf, 0.5, np.inf))
+    _, known = laid_out(poses, camera, RELIEF)
+    assert np.isfinite(pair.limits).all()
+    assert np.ptp(pair.limits) > np.ptp(known.limits)
+
+
+@pytest.mark.parametrize("pitch", [-20, -25])
+@pytest.mark.parametrize("end", [0, 1])
+def test_no_disparity_means_a_depth_out_of_reach(pitch: float, end: int, camera: Camera) -> None:
+    """Far rays and the sky have no room for the disparities that near rays may have."""
+    two_of = [pose(rotation_from_gimbal(0, pitch), [x, 0, 80]) for x in (0, 25)]
+    pair = rectify((camera, camera), (two_of[0], two_of[1]), ((60, 300), (60, 300)), Relief(-6, 0.5, 12))
+    assert pair is not None
+    v, u = np.mgrid[: pair.size[1], : pair.size[0]] + 0.5
+    depth = pair.depth(np.full(u.shape, pair.limits[end]), u, v)
+    known = np.isfinite(depth)
+    assert 0.1 < known.mean() < 1
+    assert depth[known].min() >= pair.reach[0] * 0.999
+    assert depth[known].max() <= pair.reach[1] * 1.001
 
 
 def test_frames_that_look_along_their_baseline_or_apart_are_refused(camera: Camera) -> None:

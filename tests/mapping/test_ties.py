@@ -66,7 +66,7 @@ def test_gps_is_only_wrong_where_other_images_tell_so(tmp_path: Path) -> None:
     """An image at the end of a line, which pairs alone hold, may have run off along its base: GPS is what holds it."""
     bundle = line(PAIRS + FIRM)
     gps = PLACES.copy()
-    gps[0, 1] -= 300.0
+    gps[0, 1:] -= 300.0, 30.0
     gps[4, 0] += 300.0
     frames = [Frame(f"{k}.jpg", tmp_path / f"{k}.jpg", 800, 600) for k in range(len(PLACES))]
     warnings: list[str] = []
@@ -81,6 +81,15 @@ def test_wrong_gps_of_images_in_a_row_is_wrong_together() -> None:
     chain = line([(0, 1, 2), (1, 2, 3), (2, 3, 4)] * 20)
     assert placed_by_others(chain, np.array([True, True, False, False, False])).all()
     assert not placed_by_others(line(PAIRS + FIRM), np.array([True, True, False, False, False]))[2:].any()
+
+
+def test_images_without_gps_tell_nobody_that_his_is_wrong() -> None:
+    """Two whose places nothing tells."""
+    chain = line([(0, 1, 2)] * 20 + [(3, 4)] * 20)
+    gps = PLACES.copy()
+    gps[:2], gps[2, 0] = np.nan, 300.0
+    found = without_faults(chain, gps, [Frame(f"{k}.jpg", Path(f"{k}.jpg"), 800, 600) for k in range(5)], [])
+    np.testing.assert_array_equal(found, gps)
 
 
 def test_many_matches_ask_for_more_ties() -> None:

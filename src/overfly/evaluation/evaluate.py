@@ -29,7 +29,7 @@ log = logging.getLogger("overfly")
 KEPT = "windows.jsonl"
 """File of the run folder with the measurements of one window a line, by which a stopped evaluation goes on."""
 
-FORM = 4
+FORM = 5
 """Of a line in that file: counts up when other methods or metrics are measured, so that older lines do not count."""
 
 GROUPS = {"test": "seen", "unseen": "unseen"}

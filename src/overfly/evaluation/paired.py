@@ -51,15 +51,18 @@ def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
             stands = (found.score >= WORST_SCORE[False]) & (better >= low) & (better <= high)
             if depth is matched:
                 stands &= ~contradicted(better - said, support, sigma, sure)
-                measured = np.where(stands & (found.score >= SURE), found.depth, np.float32(np.nan))
             height[stands] = better[stands]
+        # The last of the two, the pairs', is what is measured.
+        measured = np.where(stands & (found.score >= SURE) & (support >= 1), found.depth, np.float32(np.nan))
         if answer.views is not None and answer.alone is not None:
             once = answer.views[number].cpu().numpy() < 2
             alone = answer.alone[number].double().cpu().numpy()
             depths, spread = ((x / slope).astype(np.float32) for x in (np.stack([said, alone]) - base, sigma))
-            word = Opinion(depths[0], np.abs(spread), sure.astype(np.float32), 2 - once.astype(np.uint8), depths[1])
+            word = Opinion(
+                depths[0], np.abs(spread), sure.astype(np.float32), np.where(once, 1, 2).astype(np.uint8), depths[1]
+            )
             settled = word.settled(measured, frames[0].camera, frames[0].world_from_camera)
-            told = once & np.isfinite(settled.depth)
+            told = once & ~stands & np.isfinite(settled.depth)
             height[told] = np.clip(settled.depth * slope + base, low, high)[told]
             sigma = np.where(told, settled.sigma * np.abs(slope), sigma)
             sure = np.where(told, settled.confidence, sure)

@@ -99,7 +99,7 @@ def pair_depth(
         match = match if left == 0 else right_disparities(match)
         depth = depth_in_frame(match, cameras[0], poses[0], pair, right=left != 0)
         depths.append(depth)
-        sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (pair.focal * pair.baseline)))
+        sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (pair.right[0, 0] * pair.baseline)))
     if not depths:
         return np.full((height, width), np.nan, np.float32), np.zeros((height, width), np.uint8)
     depth, _, support = consensus(depths, sigmas)

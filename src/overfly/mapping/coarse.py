@@ -43,44 +43,54 @@ within which points are kept: what matches nowhere comes to lie at the ends."""
 def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
     """Points [M, 3] on the surface, some hundred of each of a few dozen pairs, from cameras and images alone.
 
-    The whole disparity range is searched, from a quarter of the image's width to 1 % of it.
+    Disparities from 2 to 90 % of the image's width are searched. Oblique pairs are looked at once more, when the height
+    of the ground is known: sheared by it they match better.
 
     Raises:
         InputError: no pair of neighbours shows the same ground.
     """
-    centres = np.array([np.asarray(f.world_from_camera)[:3, 3] for f in frames])
-    tried: dict[tuple[int, int], None] = {}
+    poses = [np.asarray(frame.world_from_camera, float) for frame in frames]
+    centres = np.array([pose[:3, 3] for pose in poses])
+    pairs: list[tuple[int, int]] = []
     step = min(max(1, len(frames) // PAIRS), APART)
     for i in range(0, len(frames), step):
         near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")
-        for j in [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]:
-            tried[min(i, j), max(i, j)] = None
-    points = _looked(frames, list(tried), None, centres, seed)
-    down = np.array([np.asarray(f.world_from_camera)[2, 2] for f in frames])
-    if (down <= -np.cos(np.deg2rad(OBLIQUE_DEG))).all():
-        return points
-    # Once the height of the ground is known, tilted pairs match better.
-    ground = float(np.median(points[:, 2]))
-    room = RELIEF * abs(float(np.median(centres[:, 2])) - ground)
-    again = _looked(frames, list(tried), Relief(ground - room, ground, ground + room), centres, seed)
-    return again[np.abs(again[:, 2] - ground) < WITHIN * room]
-
-
-def _looked(
-    frames: Sequence[Frame], pairs: Sequence[tuple[int, int]], relief: Relief | None, centres: Array, seed: int
-) -> Array:
-    """Points [M, 3] of pairs that other points confirm.
-
-    Raises:
-        InputError: no pair matches.
-    """
-    rng = np.random.default_rng(seed)
-    found = [points for i, j in pairs if (points := _matched(frames[i], frames[j], relief, rng)) is not None]
-    if not found:
+        others = [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]
+        pairs += [(min(i, j), max(i, j)) for j in others]
+    pairs = list(dict.fromkeys(pairs))
+    points = _looked(frames, pairs, [None] * len(pairs), centres, seed)
+    if not len(points):
         raise InputError(
             "No two neighbouring images match with the given cameras: check that the cameras belong to these images, "
             "or map with --cameras estimate."
         )
+    ground, lowest = float(np.median(points[:, 2])), float(centres[:, 2].min())
+    oblique = np.array([pose[2, 2] for pose in poses]) > -np.cos(np.deg2rad(OBLIQUE_DEG))
+    if not oblique.any() or ground >= lowest:
+        return points
+    room = RELIEF * (float(np.median(centres[:, 2])) - ground)
+    relief = Relief(ground - room, ground, ground + room)
+    again = _looked(frames, pairs, [relief if oblique[[i, j]].any() else None for i, j in pairs], centres, seed)
+    again = again[np.abs(again[:, 2] - ground) < WITHIN * room]
+    return again if len(again) >= DRAWN else points
+
+
+def _looked(
+    frames: Sequence[Frame],
+    pairs: Sequence[tuple[int, int]],
+    reliefs: Sequence[Relief | None],
+    centres: Array,
+    seed: int,
+) -> Array:
+    """Points [M, 3] of pairs that other points confirm; none where no pair matches."""
+    rng = np.random.default_rng(seed)
+    found = [
+        points
+        for (i, j), relief in zip(pairs, reliefs, strict=True)
+        if (points := _matched(frames[i], frames[j], relief, rng)) is not None
+    ]
+    if not found:
+        return np.zeros((0, 3))
     points = np.concatenate(found)
     height = abs(float(np.median(centres[:, 2]) - np.median(points[:, 2])))
     confirmed = _confirmed(points, np.repeat(np.arange(len(found)), DRAWN), OFF * height)
@@ -89,7 +99,7 @@ def _looked(
         return points[beside_others(points, centres)]
     # Of one pair or two: keep what lies among the others.
     away = np.abs(points[:, 2] - np.median(points[:, 2]))
-    return points[away <= 6 * np.median(away) + 1e-6]
+    return np.asarray(points[away <= 6 * np.median(away) + 1e-6])
 
 
 def _matched(first: Frame, second: Frame, relief: Relief | None, rng: np.random.Generator) -> Array | None:

@@ -32,8 +32,9 @@ class Compared:
         agree: partners whose depth there is the same.
         slope: whether the only partner that has the place inside has it between the depths of neighbouring pixels.
         taken: whether one of them has given the place already.
-        expected: partners that have the place inside and make no wide pair with this frame: if they do not know it,
-            that speaks against it. Wide ones match much less, and often something hides the place from them.
+        against: partners that have the place inside and know nothing there, or something else. One that makes a wide
+            pair with this frame counts only if it sees through the place: it matches much less, and often something
+            hides the place from it.
     """
 
     depth: NDArray
@@ -41,7 +42,7 @@ class Compared:
     agree: NDArray[np.uint8]
     slope: NDArray[np.bool_]
     taken: NDArray[np.bool_]
-    expected: NDArray[np.uint8]
+    against: NDArray[np.uint8]
 
 
 def compared(
@@ -58,21 +59,21 @@ def compared(
     widest = WIDEST * depth / own.camera.fx
     weight = 1 / sigma**2
     total, mean = weight.copy(), weight * depth
-    agree, visible, expected = (np.zeros(depth.shape, np.uint8) for _ in range(3))
+    agree, visible, against = (np.zeros(depth.shape, np.uint8) for _ in range(3))
     middle = float(np.nanmedian(depth)) if np.isfinite(depth).any() else 1.0
     taken, slope, given_there = (np.zeros(depth.shape, bool) for _ in range(3))
     one_pair = np.isfinite(depth) & ~second & (data["support"] == 1)
     for partner, other, before in partners:
         found, spread, given, theirs, inside = _look_up(own, depth, partner, other, before)
         visible += inside
-        if not is_wide(own.camera, own.world_from_camera, middle, partner.world_from_camera):
-            expected += inside
         # What pairs have matched is judged by what is left of what pairs have matched: guesses have no vote.
         found = np.where(theirs & ~second, np.float32(np.nan), found)
         with np.errstate(invalid="ignore"):
             gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
             same = np.abs(found - depth) < gate
         agree += same
+        wide = is_wide(own.camera, own.world_from_camera, middle, partner.world_from_camera)
+        against += inside & ~same & ((found > depth) | (not wide))
         taken |= same & given
         w = np.where(same, 1 / spread**2, 0)
         total += w
@@ -83,7 +84,7 @@ def compared(
     # Where more than one could see the place, one whose neighbouring pixels allow it proves nothing.
     slope &= (visible == 1) & (agree == 0)
     taken |= slope & given_there
-    return Compared(mean / total, 1 / np.sqrt(total), agree, slope, taken, expected)
+    return Compared(mean / total, 1 / np.sqrt(total), agree, slope, taken, against)
 
 
 def _look_up(

@@ -1,4 +1,4 @@
-"""How near, how far and how low the surface lies in each frame, by surface points: where pairs may match it."""
+"""Between which depths and heights the surface lies in each frame, by surface points: where pairs may match it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ how far beyond the others, as a share of the cameras' height, they are left out.
 BESIDE = 24
 """Nearest frames that tell the usual depths where a frame's own are not known."""
 
-UNDER, OVER = (0.3, 0.04), (0.3, 0.08)
+UNDER, OVER = (0.3, 0.04), (0.3, 0.12)
 """Room below and above the points' heights, as shares of their range and of the median depth: key points are rare in
 pits, on roofs and on tree tops."""
 
@@ -69,7 +69,6 @@ def depth_ranges(cameras: Sequence[Camera], poses: Sequence[Array], points: Arra
             continue
         rare = max(0.005, STRAYS / int(inside.sum()))
         first, middle, last = np.quantile(depth[inside], [rare, 0.5, 1 - rare]).tolist()
-        # Roofs and tree tops have few key points: leave room above.
         margin = 0.15 * (last - first) + 0.02 * middle
         bottom, ground, top = np.quantile(near[inside, 2], [rare, 0.5, 1 - rare]).tolist()
         under, over = (share * (top - bottom) + least * middle for share, least in (UNDER, OVER))

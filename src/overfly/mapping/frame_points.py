@@ -144,8 +144,8 @@ def frame_points(
     around: list[NDArray] = []
     seen = compared(own, data, second, _noted(own, partners, around) if walls else partners)
     agree = seen.agree
-    # Partners that have the place inside and say nothing, or something else, beyond the one that every pair leaves out.
-    silent = np.maximum(seen.expected.astype(np.int8) - np.maximum(agree, 1), 0)
+    # Every pair leaves one out.
+    silent = np.maximum(seen.against.astype(np.int8) - (agree == 0), 0)
     votes = np.maximum(agree, data["support"])
     several = data["support"] >= 2
     known = np.isfinite(depth) & (votes >= (1 if single else 2)) & ((agree >= 1) | seen.slope | several)

@@ -15,9 +15,10 @@ CANDIDATES = 40
 """Nearest cameras that are looked at."""
 
 WIDE, FURTHER = 0.9, 4
-"""Base-to-height ratio beyond which a pair counts only for ground that no better one has, as on circles with an image
-every 60 degrees; and how many such partners a frame may have besides: they see past what hides a place from others (on
-circles over blocks 0.41 of the level ground that two images see was missing, 0.81 of it where these were no pair)."""
+"""Base-to-height ratio from which on a pair is wide, as on circles with an image every 60 degrees: it is chosen for
+ground that no better one has. And how many wide partners a frame may have besides: they see past what hides a place
+from others (on circles over blocks 0.41 of the level ground that two images see was missing, 0.81 of it where these
+were no pair)."""
 
 REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
 """What seeing a place once more is worth: the first partner makes it measured, the later ones make it sure."""
@@ -79,7 +80,8 @@ def _partners(
     worth = {int(j): value for j, value in zip(near, values, strict=True) if value.mean() > 0.02}
     chosen: list[int] = []
     times = np.zeros(len(ground), int)
-    for most, wide_only in ((count, False), (count + FURTHER, True)):
+    for more, wide_only in ((count, False), (FURTHER, True)):
+        most = len(chosen) + more
         while worth and len(chosen) < most:
             repeat = np.array([REPEATS[min(t, len(REPEATS) - 1)] for t in times])
             counts = {j: wide[j] if wide_only else ~wide[j] | (times == 0) for j in worth}

@@ -172,12 +172,12 @@ def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warni
     places = places.copy()
     away = bundle.centres - places
     flat = np.linalg.norm(away[:, :2], axis=1)
-    wrong = far_off(flat)
-    wrong &= placed_by_others(bundle, ~wrong)
+    off = far_off(flat)
+    wrong = off & placed_by_others(bundle, np.isfinite(flat) & ~off)
     if wrong.any():
         warnings.append(f"The GPS position of {some_of(wrong, frames)} is far off and was not used.")
     places[wrong] = np.nan
-    rise = np.where(wrong, np.nan, away[:, 2])
+    rise = np.where(off, np.nan, away[:, 2])  # an image that has run off tells nothing of heights, nor they of it
     if np.isfinite(rise).sum() >= 4:
         known = np.isfinite(rise)
         told, seen = places[known, 2], bundle.centres[known, 2]

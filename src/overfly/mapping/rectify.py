@@ -20,8 +20,9 @@ from overfly.geometry import Array, Camera, rays
 
 Image = NDArray[np.uint8]
 
-STRETCHED = 0.5, 2.0
-"""How much wider one frame may show the ground than the other along the baseline, or the canvas stays as it is."""
+STRETCHED, SHEARED = (0.5, 2.0), 2.0
+"""How much wider one frame may show the ground than the other along the baseline, and by how many pixels a row a canvas
+may be sheared, or it stays as it is: ground that is almost as high as the cameras asks for any shear."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Rectified:
         left, right: calibration matrices [3, 3] of the two canvases; that of the right one shears.
         size: (width, height) of both canvases.
         limits: least and most disparity of the surface, pixels.
+        reach: nearest and farthest depth, metres.
     """
 
     rotation: Array
@@ -55,15 +57,18 @@ class Rectified:
     right: Array
     size: tuple[int, int]
     limits: tuple[float, float]
+    reach: tuple[float, float]
 
     def depth(self, disparity: NDArray, u: NDArray, v: NDArray, *, right: bool = False) -> NDArray:
-        """Depth along the rectified z axis of the pixels (u, v) of a canvas; NaN in, NaN out."""
+        """Depth along the rectified z axis of the pixels (u, v) of a canvas; NaN in, and out of reach, NaN out."""
         start = u + disparity if right else u
         (focal, _, u0), (stretch, shear, offset) = (matrix[0].astype(np.float32) for matrix in (self.left, self.right))
         y = (v - np.float32(self.left[1, 2])) / focal
         # Where each of the two sees the point in the plane z = 1.
         x, partner = (start - u0) / focal, (start - disparity - shear * y - offset) / stretch
-        return np.asarray(np.float32(self.baseline) / (x - partner))
+        parallax = x - partner
+        known = (parallax >= self.baseline / self.reach[1]) & (parallax <= self.baseline / self.reach[0])
+        return np.where(known, np.float32(self.baseline) / np.where(known, parallax, 1), np.float32(np.nan))
 
 
 def rectify(
@@ -98,23 +103,22 @@ def rectify(
     left, right = (_border(c, rotation.T @ p[:3, :3]) for c, p in zip(cameras, poses))
     if left is None or right is None:
         return None
-    parallax = _of_ground(rotation, baseline, (pose_l[2, 3], pose_r[2, 3]), relief)
-    sheared = np.array([1, parallax[1], parallax[2]]) / (1 - parallax[0])
-    right[:, 0] = right @ sheared
-    # All along the plane z = 1 from here to the canvases; the ground's disparity is zero.
     nearest = max(min(ranges[0][0], ranges[1][0]) * 0.9, 1e-6)
     farthest = max(ranges[0][1], ranges[1][1]) * 1.1
-    reach = baseline / farthest, baseline / nearest
-    known = relief if parallax.any() else None
-    limits = [
-        _limits(border @ parallax, pose[2, 3], reach, known) * stretch
-        for border, pose, stretch in ((left, pose_l, sheared[0]), (right, pose_r, 1.0))
-    ]
+    # All along the plane z = 1 from here to the canvases.
+    sheared, least, most = np.array([1.0, 0, 0]), baseline / farthest, baseline / nearest
+    if relief is not None and (ground := _of_ground(rotation, baseline, pose_l, pose_r, relief)) is not None:
+        shear = np.array([1, ground[1], ground[2]]) / (1 - ground[0])
+        moved = np.column_stack([right @ shear, right[:, 1:]])
+        low, high = _limits(left @ ground, pose_l[2, 3], (least, most), relief) * shear[0]
+        other_low, other_high = _limits(moved @ ground, pose_r[2, 3], (least, most), relief)
+        low, high = max(low, other_low), min(high, other_high)
+        if 0 < high - low < most - least:  # else there is more to search than without
+            sheared, right, least, most = shear, moved, low, high
     focal = (cam_l.fx + cam_l.fy + cam_r.fx + cam_r.fy) / 4
-    least, most = focal * max(low for low, _ in limits), focal * min(high for _, high in limits)
     # Single wrong points close to a camera ask for disparities without end; nothing matches over a whole image.
     widest = max(cam_l.width, cam_r.width)
-    least = least if known is None else max(least, -widest / 2)
+    least, most = float(max(focal * least, -widest / 2)), float(focal * most)
     most = min(most, least + widest)
     (l0, top_l), (r0, top_r) = (border[:, :2].min(0) * focal for border in (left, right))
     (l1, bottom_l), (r1, bottom_r) = (border[:, :2].max(0) * focal for border in (left, right))
@@ -126,35 +130,43 @@ def rectify(
         return None
     middle = float(np.round((most + least) / 2))
     matrix = np.array([[focal, 0, -start], [0, focal, -top], [0, 0, 1.0]])
+    limits = least - middle, most - middle
     other = matrix.copy()
     other[0] = focal * sheared + [0, 0, middle - start]
-    return Rectified(rotation, focal, baseline, matrix, other, (width, height), (least - middle, most - middle))
+    return Rectified(rotation, focal, baseline, matrix, other, (width, height), limits, (nearest, farthest))
 
 
-def _of_ground(rotation: Array, baseline: float, heights: tuple[float, float], relief: Relief | None) -> Array:
-    """Parallax of level ground in the plane z = 1: at a place (x, y) of the left frame (x, y, 1) times this; [3]."""
-    if relief is None or relief.ground >= min(heights):
-        return np.zeros(3)
-    found: Array = baseline * rotation[2] / (relief.ground - heights[0])
-    return found if STRETCHED[0] < 1 - found[0] < STRETCHED[1] else np.zeros(3)
+def _of_ground(rotation: Array, baseline: float, left: Array, right: Array, relief: Relief) -> Array | None:
+    """Parallax of level ground in the plane z = 1: at a place (x, y) of the left frame (x, y, 1) times this, [3].
+
+    None where it would shear or stretch the canvas too much.
+
+    Args:
+        left, right: world_from_camera [4, 4].
+    """
+    if relief.ground >= min(left[2, 3], right[2, 3]):
+        return None
+    found: Array = baseline * rotation[2] / (relief.ground - left[2, 3])
+    stretch = 1 - found[0]
+    return found if STRETCHED[0] < stretch < STRETCHED[1] and abs(found[1]) < SHEARED * stretch else None
 
 
-def _limits(ground: Array, height: float, reach: tuple[float, float], relief: Relief | None) -> Array:
+def _limits(ground: Array, height: float, reach: tuple[float, float], relief: Relief) -> Array:
     """Least and most of what parallaxes are above the ground's [N] along rays of a camera at a height z; [2].
 
     Args:
         reach: least and most parallax of all rays.
     """
-    if relief is None:
-        return np.array(reach)
-    # Rays that come down beyond the farthest depth see nothing that may be matched.
+    # Rays that come down beyond the farthest depth, or go up, see nothing that may be matched but towers.
     ground = ground[ground > reach[0]]
     if not len(ground):
         return np.zeros(2)
     over = height - relief.ground
-    lowest = ground * over / (height - relief.low)
-    highest = ground * over / (height - relief.high) if relief.high < height else np.inf
-    least, most = np.maximum(lowest, reach[0]), np.minimum(highest, reach[1])
+    rise = over / (height - relief.high) if relief.high < height else np.inf
+    # What is highest is nearest in the middle of a border, if the reach ends there.
+    ground = np.append(ground, np.clip(reach[1] / rise, ground.min(), ground.max()))
+    least = np.maximum(ground * (over / (height - relief.low)), reach[0])
+    most = np.minimum(ground * rise, reach[1])
     return np.array([(least - ground).min(), (most - ground).max()])
 
 

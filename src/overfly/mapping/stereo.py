@@ -26,7 +26,7 @@ from overfly.mapping.depth_map import DepthMap, Map, Opinion
 from overfly.mapping.depth_ranges import Span, depth_ranges
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.needs import SIZE
-from overfly.mapping.neighbours import choose_partners
+from overfly.mapping.neighbours import FURTHER, choose_partners, is_wide
 from overfly.mapping.rectify import Rectified, Relief, ordered, rectify
 from overfly.mapping.subpixel import refine
 from overfly.mapping.threads import in_threads
@@ -47,7 +47,7 @@ SURE = 0.6
 """Correlation from which on a refined depth is taken for measured before any other frame confirms it."""
 
 ASKED = 4
-"""Partners with which a network compares a frame, at most: it was trained with as many."""
+"""Partners with which a network compares a frame, at most, however many neighbours are asked: it was trained so."""
 
 AHEAD = 2
 """Frames that are begun for each worker before the first of them is finished."""
@@ -110,9 +110,11 @@ def stereo(
     def measure(i: int, ready: Sequence[Future[None]]) -> None:
         for one in ready:  # they were asked for before, so that somebody is at them or has done them
             one.result()
-        # Correlate with frames that took part, the chosen ones first.
-        chosen = partners[i] + [j for j in _all(waiting[i], i) if j not in partners[i]]
-        chosen = chosen[: max(neighbours, len(partners[i]))]
+        # Correlate with frames that took part, the chosen ones first, wide ones last.
+        took_part = partners[i] + [j for j in _all(waiting[i], i) if j not in partners[i]]
+        wide = [j for j in took_part if is_wide(flight.full[i], flight.poses[i], ranges[i].middle, flight.poses[j])]
+        near = [j for j in took_part if j not in wide][:neighbours]
+        chosen = near + wide[: neighbours + FURTHER - len(near)]
         _depth(flight, i, waiting[i], chosen, ranges, workdir, _depth_file(workdir, i), ask)
 
     asked = [i for i in range(len(frames)) if waiting[i]]
@@ -255,7 +257,7 @@ def _depth(
         depth = depth_in_frame(seen, flight.matched[i], flight.poses[i], layout, right=left != i)
         depth = np.where(depth < floor, depth, np.float32(np.nan))
         depths.append(depth)
-        sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.focal * layout.baseline)))
+        sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.right[0, 0] * layout.baseline)))
     small = flight.matched[i]
     shape = small.height, small.width
     if depths:
