@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from overfly.geometry import Camera, pixel_grid, pose, rotation_from_gimbal, unproject
+from overfly.geometry import Camera, look_at, pixel_grid, pose, rotation_from_gimbal, unproject
 from overfly.mapping.coarse import _confirmed, coarse_points
 from overfly.mapping.depth_ranges import beside_others, depth_ranges
 
@@ -27,11 +27,7 @@ def test_an_oblique_frame_does_not_see_far_under_the_ground_before_it() -> None:
 
 
 def test_a_first_look_at_oblique_images_finds_the_ground(camera: Camera, hill, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    around = [
-        pose(rotation_from_gimbal(float(azimuth) + 180, -40), [95 * np.sin(t), 95 * np.cos(t), 80])
-        for azimuth in range(0, 360, 45)
-        for t in [np.radians(azimuth)]
-    ]
+    around = [look_at([95 * np.sin(t), 95 * np.cos(t), 80], [0, 0, 0]) for t in np.radians(range(0, 360, 45))]
     frames = hill.frames(tmp_path, camera, around, known=True)
     points = coarse_points(frames, seed=0)
     off = np.abs(points[:, 2] - hill.height(points[:, :2]))

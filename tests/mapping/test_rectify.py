@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from overfly.geometry import Camera, pose, rotation_from_gimbal
+from overfly.geometry import Camera, look_at, pose, rotation_from_gimbal
 from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities, right_disparities
 from overfly.mapping.rectify import Rectified, Relief, ordered, rectify
@@ -105,11 +105,7 @@ def test_a_matched_pair_gives_the_depth_of_both_frames(name: str, camera: Camera
 
 
 def test_shearing_finds_more_and_nearer_of_what_two_tilted_frames_see(camera: Camera, hill) -> None:  # type: ignore[no-untyped-def]
-    around = [
-        pose(rotation_from_gimbal((azimuth + 180) % 360, -35), [114 * np.sin(t), 114 * np.cos(t), 80])
-        for azimuth in (180, 255)
-        for t in [np.radians(azimuth)]
-    ]
+    around = [look_at([114 * np.sin(t), 114 * np.cos(t), 80], [0, 0, 0]) for t in np.radians([180, 255])]
     right = []
     for relief in (None, Relief(-12, 0, 12)):
         poses, layout = laid_out(around, camera, relief)

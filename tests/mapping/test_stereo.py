@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from overfly.errors import InputError
-from overfly.geometry import Camera, invert, pose, rotation_from_gimbal, unproject
+from overfly.geometry import Camera, invert, look_at, pose, rotation_from_gimbal, unproject
 from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_ranges import depth_ranges
 from overfly.mapping.fuse import fuse
@@ -192,11 +192,7 @@ def test_views_that_differ_much_are_partners_where_there_are_no_better_ones(came
 
 def test_wide_partners_come_besides_those_that_already_show_the_ground(camera) -> None:  # type: ignore[no-untyped-def]
     """Eighteen images round a place: four neighbours show all of the ground, and houses hide some of it from them."""
-    angles = np.radians(20.0 * np.arange(18))
-    ring = [
-        pose(rotation_from_gimbal(float(np.degrees(a)) + 180, -55.0), [63 * np.sin(a), 63 * np.cos(a), 90])
-        for a in angles
-    ]
+    ring = [look_at([63 * np.sin(t), 63 * np.cos(t), 90], [0, 0, 0]) for t in np.radians(20.0 * np.arange(18))]
     lens = replace(camera, fx=0.9 * camera.width, fy=0.9 * camera.width)
     found = choose_partners([lens] * 18, ring, [110.0] * 18, count=2, ratio=BASE_TO_HEIGHT)
     for i, partners in enumerate(found):

@@ -12,8 +12,8 @@ from overfly.flights import Frame
 from overfly.geometry import Camera, fit_similarity, pose, project, rotation_from_gimbal, transform
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.calibration import adjusted_twice, held_by_images
-from overfly.mapping.placing import placed_by_others, without_faults
-from overfly.mapping.ties import unchecked_ties, untied
+from overfly.mapping.placing import without_faults
+from overfly.mapping.ties import placed_by_others, unchecked_ties, untied
 
 CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
 PLACES = np.array([(0.0, 50.0 * k, 100.0) for k in range(4)] + [(60.0, 150.0, 100.0)])

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from overfly.errors import InputError
 from overfly.evaluation.semi_global import semi_global
-from overfly.mapping.sweep import PER_FRAME
+from overfly.mapping.sweep import PER_FRAME, reference_alone
 from overfly.networks.baselines import NearestWindow, interpolated, lifted, mean_heights
 from overfly.networks.blocks import grid_side
 from overfly.networks.correlation import Heights, correlation_sweep
@@ -127,10 +127,10 @@ class Network:
         maps = {name: _enlarged(output[name], (height, width)) for name in ("height", "sigma", "confidence")}
         within = RIGHT_PX * 2 / output["height"].shape[2]
         views = F.interpolate(output["views"][:, None].float(), (height, width), mode="nearest")[:, 0]
-        alone = self.network(self.sized({**batch, **{name: batch[name][:, :1] for name in PER_FRAME}}))["height"]
-        return Answer(
-            output["points"], **maps, right_within=within, views=views, alone=_enlarged(alone, (height, width))
-        )
+        alone = maps["height"]
+        if batch["images"].shape[1] > 1 and bool((views < 2).any()):
+            alone = _enlarged(self.network(self.sized(reference_alone(batch)))["height"], (height, width))
+        return Answer(output["points"], **maps, right_within=within, views=views, alone=alone)
 
     @torch.no_grad()
     def encode(self, batch: Batch) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
@@ -141,7 +141,7 @@ class Network:
 
     def describe(self, batch: Batch) -> dict[str, Tensor]:
         """``descriptor`` [B, 1, D] of the reference frames, the other frames left aside."""
-        return self.encode({name: batch[name][:, :1] for name in PER_FRAME})[0]
+        return self.encode(reference_alone({name: batch[name] for name in PER_FRAME}))[0]
 
     def sized(self, batch: Batch) -> dict[str, Tensor]:
         """The windows at the image size that the network was trained with.

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from overfly.evaluation.answers import Answer, on_grid
@@ -57,10 +58,8 @@ def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
         if answer.views is not None and answer.alone is not None:
             once = answer.views[number].cpu().numpy() < 2
             alone = answer.alone[number].double().cpu().numpy()
-            depths, spread = ((x / slope).astype(np.float32) for x in (np.stack([said, alone]) - base, sigma))
-            word = Opinion(
-                depths[0], np.abs(spread), sure.astype(np.float32), np.where(once, 1, 2).astype(np.uint8), depths[1]
-            )
+            depths = (np.stack([said, alone]) - base) / slope
+            word = _opinion(depths, np.abs(sigma / slope), sure, once)
             settled = word.settled(measured, frames[0].camera, frames[0].world_from_camera)
             told = once & ~stands & np.isfinite(settled.depth)
             height[told] = np.clip(settled.depth * slope + base, low, high)[told]
@@ -74,3 +73,9 @@ def paired(answer: Answer, batch: Mapping[str, Tensor]) -> Answer:
     )
     points = on_grid(surface, batch, answer.points.shape[1])
     return replace(answer, points=points, height=surface, sigma=spreads, confidence=sure_of)
+
+
+def _opinion(depths: NDArray, sigma: NDArray, confidence: NDArray, once: NDArray) -> Opinion:
+    """What maps would keep of a network's word: depths of all frames and of the reference alone [2, H, W]."""
+    together, alone, spread, sure = (maps.astype(np.float32) for maps in (*depths, sigma, confidence))
+    return Opinion(together, spread, sure, np.where(once, 1, 2).astype(np.uint8), alone)

@@ -89,8 +89,12 @@ def pair_depth(
         if base < NO_BASE * abs(poses[0][2, 3]):
             continue  # the same frame again
         left, right = (0, other) if ordered((poses[0], poses[other])) else (other, 0)
-        both = (cameras[left], cameras[right]), (poses[left], poses[right]), (ranges[left], ranges[right])
-        pair = rectify(*both, Relief(height_range[0], 0.0, height_range[1]))
+        pair = rectify(
+            (cameras[left], cameras[right]),
+            (poses[left], poses[right]),
+            (ranges[left], ranges[right]),
+            Relief(height_range[0], 0.0, height_range[1]),
+        )
         if pair is None:
             continue
         match = disparities(
@@ -99,7 +103,7 @@ def pair_depth(
         match = match if left == 0 else right_disparities(match)
         depth = depth_in_frame(match, cameras[0], poses[0], pair, right=left != 0)
         depths.append(depth)
-        sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (pair.right[0, 0] * pair.baseline)))
+        sigmas.append(pair.sigma(depth, DISPARITY_SIGMA))
     if not depths:
         return np.full((height, width), np.nan, np.float32), np.zeros((height, width), np.uint8)
     depth, _, support = consensus(depths, sigmas)

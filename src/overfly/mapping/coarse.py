@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, unproject
-from overfly.mapping.depth_map import OBLIQUE_DEG
+from overfly.mapping.depth_map import is_oblique
 from overfly.mapping.depth_ranges import beside_others
 from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities
 from overfly.mapping.rectify import Relief, ordered, rectify
@@ -58,37 +58,32 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
         others = [j for j in near.tolist() if j != i and np.any(centres[j] != centres[i])][:3]
         pairs += [(min(i, j), max(i, j)) for j in others]
     pairs = list(dict.fromkeys(pairs))
-    points = _looked(frames, pairs, [None] * len(pairs), centres, seed)
+    rng = np.random.default_rng(seed)
+    found = [_matched(frames[i], frames[j], None, rng) for i, j in pairs]
+    points = _standing(found, centres)
     if not len(points):
         raise InputError(
             "No two neighbouring images match with the given cameras: check that the cameras belong to these images, "
             "or map with --cameras estimate."
         )
-    ground, lowest = float(np.median(points[:, 2])), float(centres[:, 2].min())
-    oblique = np.array([pose[2, 2] for pose in poses]) > -np.cos(np.deg2rad(OBLIQUE_DEG))
-    if not oblique.any() or ground >= lowest:
+    ground, oblique = float(np.median(points[:, 2])), [is_oblique(pose) for pose in poses]
+    if not any(oblique) or ground >= centres[:, 2].min():
         return points
     room = RELIEF * (float(np.median(centres[:, 2])) - ground)
     relief = Relief(ground - room, ground, ground + room)
-    again = _looked(frames, pairs, [relief if oblique[[i, j]].any() else None for i, j in pairs], centres, seed)
+    rng = np.random.default_rng(seed)
+    found = [
+        _matched(frames[i], frames[j], relief, rng) if oblique[i] or oblique[j] else level
+        for (i, j), level in zip(pairs, found, strict=True)
+    ]
+    again = _standing(found, centres)
     again = again[np.abs(again[:, 2] - ground) < WITHIN * room]
     return again if len(again) >= DRAWN else points
 
 
-def _looked(
-    frames: Sequence[Frame],
-    pairs: Sequence[tuple[int, int]],
-    reliefs: Sequence[Relief | None],
-    centres: Array,
-    seed: int,
-) -> Array:
-    """Points [M, 3] of pairs that other points confirm; none where no pair matches."""
-    rng = np.random.default_rng(seed)
-    found = [
-        points
-        for (i, j), relief in zip(pairs, reliefs, strict=True)
-        if (points := _matched(frames[i], frames[j], relief, rng)) is not None
-    ]
+def _standing(matched: Sequence[Array | None], centres: Array) -> Array:
+    """Points [M, 3] of pairs that those of other pairs confirm; none where no pair matches."""
+    found = [points for points in matched if points is not None]
     if not found:
         return np.zeros((0, 3))
     points = np.concatenate(found)

@@ -71,9 +71,10 @@ def compared(
         with np.errstate(invalid="ignore"):
             gate = GATE * np.hypot(np.minimum(sigma, widest), np.minimum(spread, widest))
             same = np.abs(found - depth) < gate
+            through = found > depth
         agree += same
         wide = is_wide(own.camera, own.world_from_camera, middle, partner.world_from_camera)
-        against += inside & ~same & ((found > depth) | (not wide))
+        against += inside & ~same & (through | (not wide))
         taken |= same & given
         w = np.where(same, 1 / spread**2, 0)
         total += w

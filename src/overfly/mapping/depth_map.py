@@ -15,6 +15,12 @@ from overfly.mapping.anchor import RIGHT, Map, anchored
 OBLIQUE_DEG = 20.0
 """Tilt from which on an image is oblique."""
 
+
+def is_oblique(world_from_camera: Array) -> bool:
+    """Whether a frame [4, 4], z up, is tilted so far from looking down."""
+    return bool(world_from_camera[2, 2] > -np.cos(np.deg2rad(OBLIQUE_DEG)))
+
+
 ONE_SIGMA = 0.683
 """Share of errors below one standard deviation."""
 
@@ -81,7 +87,7 @@ class Opinion:
         fall = rays(pixel_grid(width, height), camera.resized(width, height)) @ world_from_camera[2, :3]
         fall = np.minimum(fall, -0.1).astype(np.float32)  # metres down per metre of depth
         small = cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST)
-        oblique = world_from_camera[2, 2] > -np.cos(np.deg2rad(OBLIQUE_DEG))
+        oblique = is_oblique(world_from_camera)
         heights, sure = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32), oblique)
         # A slope carried on far enough passes the camera.
         depth = np.where(heights < 0, heights / fall, np.float32(np.nan))

@@ -21,16 +21,16 @@ WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
 
 UNMATCHED = 0.15
-"""What is added to that for each further partner that has the place inside and has not matched it."""
+"""What is added to that for each further partner that speaks against the place (:class:`Compared`)."""
 
 SURE_THOUGH_SEEN, SURER = 0.7, 0.1
-"""Confidence from which on a network's word alone stands where another frame has the place inside and nothing is
-matched, and what is added for each further one: against four it never stands."""
+"""Confidence from which on a network's word alone stands where another frame that has the place inside has matched
+nothing, and what is added for each further one that speaks against it: against four it never stands."""
 
 AGREED, AGREED_UNSEEN = 0.8, 0.6
 """Confidence from which on a depth stands that began with a network's word and that another frame agrees with: the
-first where further frames have the place inside and say something else, as on waves and in shadows, the second where
-none has. It is the network's own, or, of a word that was moved to where images correlate, that of matched points."""
+first where further frames speak against it, as on waves and in shadows, the second where none does. It is the
+network's own, or, of a word that was moved to where images correlate, that of matched points."""
 
 NEAR, AWAY = 4, 30
 """Voxels along a cell of the plan in which one matched point makes a guess needless: the first if it is sure
@@ -144,7 +144,7 @@ def frame_points(
     around: list[NDArray] = []
     seen = compared(own, data, second, _noted(own, partners, around) if walls else partners)
     agree = seen.agree
-    # Every pair leaves one out.
+    # Where nobody agrees one of them is the partner that it was matched with, whose own map leaves such places out.
     silent = np.maximum(seen.against.astype(np.int8) - (agree == 0), 0)
     votes = np.maximum(agree, data["support"])
     several = data["support"] >= 2

@@ -13,7 +13,7 @@ from overfly.flights import Frame
 from overfly.flights.georeference import by_gps, level_line, on_a_line
 from overfly.geometry import Array, rotation_from_gimbal
 from overfly.mapping.bundle import Bundle, merged
-from overfly.mapping.ties import FEWEST
+from overfly.mapping.ties import placed_by_others
 
 GPS_SIGMA_M = (0.5, 0.5)
 """Standard deviation of GPS within one flight, horizontal and vertical, where the file does not state it."""
@@ -150,21 +150,6 @@ def tilted(bundle: Bundle, frames: Sequence[Frame]) -> NDArray[np.bool_]:
 def far_off(distance: Array) -> NDArray[np.bool_]:
     """Which of positions that are so many metres off [n] are wrong: further than most, and than an antenna makes it."""
     return np.asarray(distance > max(FAR_OFF_M, 6 * float(np.nanmedian(distance))))
-
-
-def placed_by_others(bundle: Bundle, sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Images [n] whose places images alone tell: the sure ones, and those tied to two of them, one after another.
-
-    Points that an image shares with one other tell in which direction it stands, not how far away: whatever its GPS
-    says, nothing contradicts it.
-    """
-    told, before = sure.copy(), -1
-    while before < told.sum():
-        before = int(told.sum())
-        seen_by = np.bincount(bundle.point[told[bundle.image]], minlength=len(bundle.points))
-        ties = np.bincount(bundle.image[(seen_by >= 2)[bundle.point]], minlength=len(bundle))
-        told |= ties >= FEWEST
-    return told
 
 
 def without_faults(bundle: Bundle, places: Array, frames: Sequence[Frame], warnings: list[str]) -> Array:

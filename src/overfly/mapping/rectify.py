@@ -59,6 +59,14 @@ class Rectified:
     limits: tuple[float, float]
     reach: tuple[float, float]
 
+    def matrix(self, right: bool) -> Array:
+        """Calibration matrix [3, 3] of one canvas."""
+        return self.right if right else self.left
+
+    def sigma(self, depth: NDArray, disparity_sigma: float) -> NDArray:
+        """Standard deviation of depths [H, W] by that of their disparities, pixels."""
+        return np.asarray(depth * depth * np.float32(disparity_sigma / (self.right[0, 0] * self.baseline)))
+
     def depth(self, disparity: NDArray, u: NDArray, v: NDArray, *, right: bool = False) -> NDArray:
         """Depth along the rectified z axis of the pixels (u, v) of a canvas; NaN in, and out of reach, NaN out."""
         start = u + disparity if right else u
@@ -195,7 +203,7 @@ def canvas_map(camera: Camera, world_from_camera: Array, pair: Rectified, *, rig
     import cv2
 
     turn = pair.rotation.T @ world_from_camera[:3, :3]
-    matrix, canvas = camera.matrix(), (pair.right if right else pair.left).copy()
+    matrix, canvas = camera.matrix(), pair.matrix(right).copy()
     # cv2 counts pixel centres from 0, this project from 0.5.
     matrix[:2, 2] -= 0.5
     canvas[:2, 2] -= 0.5
@@ -205,5 +213,4 @@ def canvas_map(camera: Camera, world_from_camera: Array, pair: Rectified, *, rig
 
 def from_canvas(camera: Camera, world_from_camera: Array, pair: Rectified, *, right: bool) -> Array:
     """Homography [3, 3] that takes pixels of the undistorted frame to canvas pixels (both in this project's pixels)."""
-    canvas = pair.right if right else pair.left
-    return np.asarray(canvas @ pair.rotation.T @ world_from_camera[:3, :3] @ np.linalg.inv(camera.matrix()))
+    return np.asarray(pair.matrix(right) @ pair.rotation.T @ world_from_camera[:3, :3] @ np.linalg.inv(camera.matrix()))

@@ -257,7 +257,7 @@ def _depth(
         depth = depth_in_frame(seen, flight.matched[i], flight.poses[i], layout, right=left != i)
         depth = np.where(depth < floor, depth, np.float32(np.nan))
         depths.append(depth)
-        sigmas.append(depth * depth * np.float32(DISPARITY_SIGMA / (layout.right[0, 0] * layout.baseline)))
+        sigmas.append(layout.sigma(depth, DISPARITY_SIGMA))
     small = flight.matched[i]
     shape = small.height, small.width
     if depths:

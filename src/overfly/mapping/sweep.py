@@ -26,6 +26,12 @@ what several frames see is refined at full size anyway, and what one sees is car
 PER_FRAME = ("images", "intrinsics", "camera_from_window", "prior_from_window")
 """What a batch holds of each frame [B, K, ...] and a network looks at."""
 
+
+def reference_alone(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """A batch whose windows hold their reference frame only."""
+    return {name: value[:, :1] if name in PER_FRAME else value for name, value in batch.items()}
+
+
 FEWEST = 20
 """Surface points that tell the height of the ground under a frame."""
 
@@ -97,8 +103,7 @@ class SweepOpinions:
             depth, along = _depth(answer["height"], batch)
             alone = depth
             if len(chosen) > 1 and bool((answer["views"] < 2).any()):
-                single = {name: value[:, :1] if name in PER_FRAME else value for name, value in batch.items()}
-                alone, _ = _depth(self.network(single)["height"], batch)
+                alone, _ = _depth(self.network(reference_alone(batch))["height"], batch)
         found = {
             "depth": depth * scale,
             "alone": alone * scale,

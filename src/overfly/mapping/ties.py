@@ -60,3 +60,18 @@ def untied(bundle: Bundle) -> NDArray[np.bool_]:
     views = np.bincount(bundle.point, minlength=len(bundle.points))[bundle.point]
     tied = np.bincount(bundle.image[views >= 3], minlength=len(bundle)) > 0
     return np.asarray(~tied & (np.bincount(bundle.image, minlength=len(bundle)) > 0))
+
+
+def placed_by_others(bundle: Bundle, sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Images [n] whose places images alone tell: the sure ones, and those tied to two of them, one after another.
+
+    Points that an image shares with one other tell in which direction it stands, not how far away: whatever its GPS
+    says, nothing contradicts it.
+    """
+    told, before = sure.copy(), -1
+    while before < told.sum():
+        before = int(told.sum())
+        seen_by = np.bincount(bundle.point[told[bundle.image]], minlength=len(bundle.points))
+        ties = np.bincount(bundle.image[(seen_by >= 2)[bundle.point]], minlength=len(bundle))
+        told |= ties >= FEWEST
+    return told
