@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from overfly.flights import Frame
 from overfly.geometry import Array
+from overfly.mapping.database import focal_px
+from overfly.mapping.nadir_view import nadir_view
 
 FEATURES = 5000
 LONGEST_SIDE = 1600
@@ -28,6 +30,7 @@ SMALL_FLIGHT = 8
 def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Pixels [n, 2] (centres at +0.5) and RootSIFT descriptors [n, 128], the coarsest first; kept in ``folder``.
 
+    Tilted images are looked at from straight above (:mod:`overfly.mapping.nadir_view`).
     Lowe, "Distinctive image features from scale-invariant keypoints" (2004); square roots after Arandjelović &
     Zisserman (2012), scaled to bytes as COLMAP expects them.
     """
@@ -41,13 +44,15 @@ def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[n
     factor = min(1.0, LONGEST_SIDE / max(gray.shape))
     if factor < 1:
         gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    focal = focal_px(frame)
+    down = None if frame.gimbal is None or focal is None else nadir_view(gray, frame.gimbal, focal * factor)
     # A low contrast threshold: meadows and asphalt have key points too, and the strongest are chosen anyway.
     sift = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
-    found, raw = sift.detectAndCompute(gray, None)
+    found, raw = sift.detectAndCompute(gray, None) if down is None else sift.detectAndCompute(down.image, down.mask)
     if len(found):
         order = np.argsort([-point.size for point in found], kind="stable")[:FEATURES]
-        places = np.array([point.pt for point in found], np.float32)[order]
-        pixels = (places + 0.5) / np.float32(factor)
+        places = np.array([point.pt for point in found], np.float32)[order] + np.float32(0.5)
+        pixels = (places if down is None else down.in_image(places).astype(np.float32)) / np.float32(factor)
         root = np.sqrt(raw[order] / np.maximum(raw[order].sum(1, keepdims=True), 1e-9))
         descriptors = np.clip(np.round(512 * root), 0, 255).astype(np.uint8)
     else:
