@@ -3,59 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from two_lines import CAMERA, Block
 
-from overfly.flights import Frame
-from overfly.geometry import Array, Camera, fit_similarity, pose, project, rotation_from_gimbal
+from overfly.geometry import Array, fit_similarity, pose, project, rotation_from_gimbal
 from overfly.mapping.bundle import Bundle, components
 from overfly.mapping.by_priors import bundle_by_priors
 from overfly.mapping.guided import guided_matches
+from overfly.mapping.overlays import Prior
 from overfly.mapping.placing import agrees_with_gps, placed, tilted
-
-CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
-SHOWN = 250
-"""Key points of a frame."""
-
-
-class Block:
-    """Two lines of four frames at 100 m over rough ground; every ground point has a descriptor of its own."""
-
-    def __init__(self, seed: int = 0) -> None:
-        rng = np.random.default_rng(seed)
-        self.places = np.array([(60.0 * (k // 4), 45.0 * (k % 4), 100.0) for k in range(8)])
-        self.yaws = np.where(np.arange(8) < 4, 0.0, 180.0)
-        self.poses = np.stack(
-            [pose(rotation_from_gimbal(yaw, -90), place) for yaw, place in zip(self.yaws, self.places, strict=True)]
-        )
-        self.ground = np.column_stack([rng.uniform(-80, 220, (2500, 2)), rng.uniform(0, 8, 2500)])
-        looks = rng.integers(0, 80, (2500, 128)).astype(np.uint8)
-        self.features, self.seen = [], []
-        for matrix in self.poses:
-            pixels, depth = project(self.ground, CAMERA, matrix)
-            inside = np.flatnonzero((depth > 0) & ((pixels > 0) & (pixels < (800, 600))).all(1))
-            shown = rng.permutation(inside)[:SHOWN]
-            self.seen.append(shown)
-            noisy = pixels[shown] + rng.normal(0, 0.2, (len(shown), 2))
-            self.features.append((noisy, np.clip(looks[shown] + rng.integers(0, 4, (len(shown), 128)), 0, 255)))
-        # Priors: GPS off by 2 m, all headings by 2 degrees and each by half a degree.
-        self.told = self.places + rng.normal(0, 2, (8, 3))
-        self.frames = [
-            Frame(f"{k}.jpg", Path(f"{k}.jpg"), 800, 600, focal_px=600.0, gimbal=(float(yaw), -89.7, 0.0))
-            for k, yaw in enumerate(self.yaws + 2 + rng.normal(0, 0.5, 8))
-        ]
-
-    def common(self, most: int, without: int = -1) -> dict[tuple[int, int], np.ndarray]:
-        """Right matches, at most so many of a pair, none of one frame."""
-        found = {}
-        for i in range(8):
-            for j in range(i + 1, 8):
-                both = np.intersect1d(self.seen[i], self.seen[j], return_indices=True)
-                if len(both[0]) >= 3 and without not in (i, j):
-                    found[i, j] = np.column_stack(both[1:])[:most].astype(np.uint32)
-        return found
 
 
 def misses(block: Block, bundle: Bundle) -> float:
@@ -80,6 +38,24 @@ def test_few_matches_and_priors_make_a_block_with_every_frame() -> None:
     assert np.median(found.errors()) < 0.5
     assert misses(block, found) < 6  # GPS alone: the test below
     assert found.lenses[0, 0] == pytest.approx(600, rel=1e-6)
+
+
+def test_what_is_alike_where_priors_put_it_makes_a_block_of_images_that_nothing_has_matched() -> None:
+    """Heights over the ground are told; one line is tilted by 40 degrees and looks back at the other's ground."""
+    block = Block(tilt=40.0)
+    level = np.median(block.ground[:, 2])
+    turns = [rotation_from_gimbal(*(frame.gimbal or (0, 0, 0))) for frame in block.frames]
+    priors = [
+        Prior(CAMERA, pose(turn, [*place[:2], place[2] - level])) for turn, place in zip(turns, block.told, strict=True)
+    ]
+    few = {pair: rows[:8] for pair, rows in block.common(8).items() if pair == (0, 1)}
+    assert bundle_by_priors(block.frames, block.told, block.features, {}, [1] * 8) is None
+    found = bundle_by_priors(block.frames, block.told, block.features, few, [1] * 8, priors=priors)
+    assert found is not None
+    assert found.frames.tolist() == list(range(8))
+    assert np.median(found.errors()) < 0.5
+    assert misses(block, found) < 6
+    assert any(k < 4 <= j for k, j in found.links()), "both lines are tied to each other"
 
 
 def test_the_images_correct_what_gps_and_gimbals_say() -> None:

@@ -71,15 +71,15 @@ def test_a_model_that_puts_an_image_elsewhere_asks_for_another_way(
 
 def test_only_matches_between_images_of_the_model_count() -> None:
     half = Fake([0, 1], {(0, 1): 50})
-    assert model._upheld(half, MATCHES) == 2
-    assert model._upheld(Fake([0, 1], {(0, 1): 49}), MATCHES) == 0
-    assert model._upheld(Fake([0, 3], {}), MATCHES) == 2, "they have none: nothing contradicts them"
+    assert model.upheld(half, MATCHES) == 2
+    assert model.upheld(Fake([0, 1], {(0, 1): 49}), MATCHES) == 0
+    assert model.upheld(Fake([0, 3], {}), MATCHES) == 2, "they have none: nothing contradicts them"
     copy = Fake([0, 1], {})
     copy.centres[1] = copy.centres[0] + [0, 1, 0]
-    assert model._upheld(copy, MATCHES) == 0, "a model that has collapsed to a point is no good one"
+    assert model.upheld(copy, MATCHES) == 0, "a model that has collapsed to a point is no good one"
     hovered = Fake([0, 1, 2], {(1, 2): 100})
     hovered.centres[0] = hovered.centres[1] + [0, 1, 0]
     matches = {**MATCHES, (0, 2): 100}
-    assert model._upheld(hovered, matches) == 2
+    assert model.upheld(hovered, matches) == 2
     hovered.common[0, 2] = 90
-    assert model._upheld(hovered, matches) == 3, "from one place no point can be told, from others it can"
+    assert model.upheld(hovered, matches) == 3, "from one place no point can be told, from others it can"

@@ -11,6 +11,7 @@ import pytest
 
 from overfly.flights import Flight, Frame
 from overfly.mapping import sparse
+from overfly.mapping.agreement import Agreement
 
 
 class Part:
@@ -71,7 +72,8 @@ def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_neede
     monkeypatch.setattr(sparse, "mapped", mapped)
     monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: agrees)
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
-    monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
+    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], []))
+    monkeypatch.setattr(sparse, "upheld", lambda part, _: len(part))
     monkeypatch.setattr(sparse, "bundle_by_priors", by_priors)
     monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
     names = [f"{i}.jpg" for i in range(20)]
@@ -117,7 +119,8 @@ def test_more_matches_are_asked_for_where_they_are_too_few(
     )
     monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_: part.name != against)
     monkeypatch.setattr(sparse, "read_points", lambda database, _: (read.append(database.name), []))
-    monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
+    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], []))
+    monkeypatch.setattr(sparse, "upheld", lambda part, _: len(part))
     monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: PRIOR)
     monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
     flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(20)])

@@ -18,7 +18,9 @@ from overfly.mapping.bundle import Bundle, Index
 from overfly.mapping.calibration import LOOSE, ROUGHLY, held_by_images
 from overfly.mapping.database import focal_px
 from overfly.mapping.guided import guided_matches
+from overfly.mapping.overlays import Prior
 from overfly.mapping.placing import gps_sigmas
+from overfly.mapping.relative import agreeing
 
 UNIT_PX = 800
 """Longest side of an image to which the lengths below belong, in its pixels; larger ones have larger pixels' errors."""
@@ -26,12 +28,25 @@ UNIT_PX = 800
 FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
 """What a ray is taken to be worth, pixels, one adjustment after another: at first directions are wrong by a degree."""
 
+UP_SIGMA_DEG = 3.0
+"""What the gimbal's vertical is taken to be worth: a few wrong matches shall not tilt an image."""
+
 REACH_PX, FAR_REACH_PX = 3.0, 40.0
 """Off its epipolar line a key point is looked for so far, and so far if one of the images has no match yet."""
 
+FIRST_REACH_PX, FIRST_HEIGHTS = 60.0, (-0.15, 0.3)
+"""Off its epipolar line, and between which heights over the ground, in the cameras' heights over it, a key point is
+looked for before any camera is adjusted."""
+
+ENOUGH = 15
+"""Matches of a pair from which on nothing more is looked for by then."""
+
 FOOTPRINTS_APART, NEAREST = 1.2, 8
-"""Images are compared with so many nearest ones, no farther than so many times the ground that one sees, corner to
-corner."""
+"""Images are compared with so many whose middles lie nearest, no farther than so many times the ground that one sees,
+corner to corner."""
+
+FLATTEST = 0.4
+"""Cosine from nadir: of flatter images the nearer ground counts."""
 
 RELIEF = (0.02, 0.98, 0.5)
 """Shares of the points between whose heights the ground is looked for, and how much more, of their range, each way."""
@@ -53,12 +68,15 @@ def bundle_by_priors(
     verified: Verified,
     lens_ids: Sequence[int],
     *,
+    priors: Sequence[Prior | None] = (),
+    seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Bundle | None:
     """The frames with GPS, gimbal and focal length, adjusted to their matches; None where these do not fit.
 
-    What was matched without knowing anything is adjusted first. Then key points are matched again, only where they can
-    be (:mod:`overfly.mapping.guided`): that finds several times as many, also in images that had none.
+    What was matched without knowing anything is adjusted first, with what pairs that have hardly any matches show where
+    their priors put them. Then key points are matched again, only where they can be (:mod:`overfly.mapping.guided`):
+    that finds several times as many, also in images that had none.
 
     Args:
         frames: of the flight, n of them.
@@ -67,6 +85,8 @@ def bundle_by_priors(
             of a network have none.
         verified: of pairs (i, j), rows of indices of their key points [m, 2].
         lens_ids: what the database calls the camera of each frame.
+        priors: where each frame stands over the ground, None where that is unknown.
+        seed: of random draws.
         progress: called with (pairs matched again, in all).
     """
     known = [
@@ -75,8 +95,8 @@ def bundle_by_priors(
         if np.isfinite(told[i]).all() and frame.gimbal is not None and focal_px(frame) is not None
     ]
     rank = {i: k for k, i in enumerate(known)}
-    rows = {(rank[i], rank[j]): r for (i, j), r in verified.items() if i in rank and j in rank and len(r)}
-    if len(known) < 2 or not rows:
+    rows: Verified = {(rank[i], rank[j]): r for (i, j), r in verified.items() if i in rank and j in rank and len(r)}
+    if len(known) < 2:
         return None
     own = [features[i] for i in known]
     ids = tuple(sorted({lens_ids[i] for i in known}))
@@ -94,7 +114,11 @@ def bundle_by_priors(
         pixels=np.zeros((0, 2)),
     )
     places, sigmas = told[known], gps_sigmas([frames[i] for i in known]) * LOOSE
-    bundle = _fitted(start, own, rows, frames, places, sigmas, FIRST_SIGMAS_PX)
+    rows = _first(start, own, rows, [priors[i] for i in known] if len(priors) else [None] * len(known), seed)
+    if not rows:
+        return None
+    ups = start.rotations[:, :, 2]
+    bundle = _fitted(start, own, rows, frames, places, sigmas, ups, FIRST_SIGMAS_PX)
     if len(bundle.points) < FEWEST_RAYS:
         return None
     seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
@@ -104,7 +128,7 @@ def bundle_by_priors(
         rotations=np.where(seen[:, None, None], bundle.rotations, start.rotations),
         centres=np.where(seen[:, None], bundle.centres, start.centres + shift),
     )
-    bundle = _fitted(bundle, own, _more(bundle, own, rows, progress), frames, places, sigmas, SIGMAS_PX)
+    bundle = _fitted(bundle, own, _more(bundle, own, rows, progress), frames, places, sigmas, ups, SIGMAS_PX)
     while len(bundle) and (few := np.bincount(bundle.image, minlength=len(bundle)) < FEWEST_RAYS).any():
         bundle = bundle.without(few)
     return bundle if len(bundle) >= 2 else None
@@ -117,6 +141,7 @@ def _fitted(
     frames: Sequence[Frame],
     places: Array,
     place_sigmas: Array,
+    ups: Array,
     sigmas_px: Sequence[float],
 ) -> Bundle:
     """Cameras adjusted to the tracks of matches, from where they are."""
@@ -132,11 +157,37 @@ def _fitted(
             pixel_sigma=np.full(len(bundle.image), sigma),
             places=places,
             place_sigmas=place_sigmas,
+            ups=ups,
+            up_sigma=np.radians(UP_SIGMA_DEG),
             lens_fixed=np.ones(len(bundle.lenses), bool),
         )
         bundle = adjusted(bundle, held, tolerance=ROUGHLY).bundle
         bundle = bundle.kept(bundle.errors() < max(unit * FARTHEST_PX, 4 * sigma))
     return bundle.kept(bundle.errors() < unit * FARTHEST_PX)
+
+
+def _first(
+    start: Bundle, features: Sequence[Features], rows: Verified, priors: Sequence[Prior | None], seed: int
+) -> Verified:
+    """The matches, and of pairs with few those that agree with the priors among what is alike where these put it."""
+    above = [p.world_from_camera[2, 3] for p in priors if p is not None]
+    if not above:
+        return rows
+    tops = [z - p.world_from_camera[2, 3] for z, p in zip(start.centres[:, 2], priors, strict=True) if p is not None]
+    level, height = float(np.median(tops)), float(np.median(above))
+    heights = level + FIRST_HEIGHTS[0] * height, level + FIRST_HEIGHTS[1] * height
+    unit, found = _unit(start), dict(rows)
+    for i, j in _near(start, level):
+        first, second = priors[i], priors[j]
+        had = rows.get((i, j), np.zeros((0, 2), np.uint32))
+        if first is None or second is None or len(had) >= ENOUGH:
+            continue
+        new = _guided(start, (i, j), features, heights, FIRST_REACH_PX * max(unit[i], unit[j]))
+        both = np.unique(np.concatenate([had, new]), axis=0)
+        pixels = features[i][0][both[:, 0]], features[j][0][both[:, 1]]
+        if (good := agreeing(first, second, pixels, seed)).sum() > len(had):
+            found[i, j] = both[good]
+    return found
 
 
 def _more(
@@ -147,27 +198,44 @@ def _more(
     low, high = np.quantile(bundle.points[:, 2], [least, most])
     heights = float(low - more * (high - low)), float(high + more * (high - low))
     seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
-    corner = np.linalg.norm(bundle.lenses[bundle.lens_of, 1:3], axis=1) / bundle.lenses[bundle.lens_of, 0]
-    shown = 2 * corner * np.maximum(bundle.centres[:, 2] - low, 0)
-    unit = np.maximum(1.0, 2 * bundle.lenses[bundle.lens_of, 1:3].max(1) / UNIT_PX)
-    near: set[tuple[int, int]] = set()
-    for i in range(len(bundle)):
-        away = np.linalg.norm((bundle.centres - bundle.centres[i])[:, :2], axis=1)
-        away[i] = np.inf
-        partners = np.argsort(away, kind="stable")[:NEAREST]
-        partners = partners[away[partners] < FOOTPRINTS_APART * shown[i]]
-        near |= {(min(i, j), max(i, j)) for j in partners.tolist()}
-    found = dict(rows)
-    for done, (i, j) in enumerate(sorted(near)):
+    unit, near, found = _unit(bundle), _near(bundle, float(low)), dict(rows)
+    for done, (i, j) in enumerate(near):
         reach = (REACH_PX if seen[i] and seen[j] else FAR_REACH_PX) * max(unit[i], unit[j])
-        looks = features[i][1], features[j][1]
-        pixels = features[i][0][: len(looks[0])], features[j][0][: len(looks[1])]
-        new = guided_matches(bundle, (i, j), pixels, looks, heights, reach)
+        new = _guided(bundle, (i, j), features, heights, reach)
         if len(new):
             found[i, j] = np.unique(np.concatenate([rows.get((i, j), new[:0]), new]), axis=0)
         if progress:
             progress(done + 1, len(near))
     return found
+
+
+def _unit(bundle: Bundle) -> Array:
+    """Pixels [n] of each image in those of :data:`UNIT_PX`."""
+    return np.maximum(1.0, 2 * bundle.lenses[bundle.lens_of, 1:3].max(1) / UNIT_PX)
+
+
+def _near(bundle: Bundle, ground: float) -> list[tuple[int, int]]:
+    """Pairs i < j of images that may see common ground at a height: what is in their middles lies near."""
+    corner = np.linalg.norm(bundle.lenses[bundle.lens_of, 1:3], axis=1) / bundle.lenses[bundle.lens_of, 0]
+    above = np.maximum(bundle.centres[:, 2] - ground, 0)
+    ahead = bundle.rotations[:, 2]
+    middle = bundle.centres[:, :2] + ahead[:, :2] / np.maximum(-ahead[:, 2:], FLATTEST) * above[:, None]
+    near: set[tuple[int, int]] = set()
+    for i in range(len(bundle)):
+        away = np.linalg.norm(middle - middle[i], axis=1)
+        away[i] = np.inf
+        partners = np.argsort(away, kind="stable")[:NEAREST]
+        partners = partners[away[partners] < FOOTPRINTS_APART * 2 * corner[i] * above[i]]
+        near |= {(min(i, j), max(i, j)) for j in partners.tolist()}
+    return sorted(near)
+
+
+def _guided(
+    bundle: Bundle, pair: tuple[int, int], features: Sequence[Features], heights: tuple[float, float], reach: float
+) -> NDArray[np.uint32]:
+    looks = features[pair[0]][1], features[pair[1]][1]
+    pixels = features[pair[0]][0][: len(looks[0])], features[pair[1]][0][: len(looks[1])]
+    return guided_matches(bundle, pair, pixels, looks, heights, reach)
 
 
 def _tracks(pixels: Sequence[NDArray], rows: Verified) -> tuple[Index, Index, Array]:

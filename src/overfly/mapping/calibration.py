@@ -17,7 +17,7 @@ from overfly.mapping.database import focal_px
 from overfly.mapping.features import LONGEST_SIDE
 from overfly.mapping.model import FEWEST_TO_CALIBRATE
 from overfly.mapping.placing import widened
-from overfly.mapping.ties import unchecked_ties
+from overfly.mapping.ties import unchecked_ties, untied
 
 UNTOLD = "The images do not tell the focal length"
 KEPT = "The calibration is kept, but the map that it comes from did not tell its focal length well"
@@ -44,6 +44,10 @@ FEWEST_RAYS_TO_FREE = 150
 
 GAIN = 0.01
 """Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
+
+FARTHEST = 0.25
+"""Share by which a focal length is other than the photos tell only where all images share points with two others at
+once: else GPS alone tells how far apart cameras stand, and the focal length bends to its errors."""
 
 NO_LENS_SIGMA = 0.0001
 """Standard deviation of k1 and k2 until the images ask for a lens."""
@@ -132,7 +136,9 @@ def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
         if np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE and rays >= FEWEST_RAYS_TO_FREE:
             free_focal = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
             focal = adjusted(result.bundle, free_focal, lever=start, tolerance=hopeless, patience=PATIENCE)
-            if result.cost - focal.cost > needed:
+            off = np.abs(focal.bundle.lenses[:, 0] / result.held.focals - 1)
+            loose = bool((off > FARTHEST).any()) and untied(result.bundle).any()
+            if result.cost - focal.cost > needed and not loose:
                 result, untold = focal, False
     return adjusted(result.bundle, result.held, lever=result.lever), untold
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +150,14 @@ def _of_frames(
     return by_frames
 
 
+def read_pixels(path: Path, names: Sequence[str]) -> list[NDArray]:
+    """Of each frame the pixels [n, 2] of its key points."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as db:
+        return [db.read_keypoints(db.read_image_with_name(name).image_id)[:, :2] for name in names]
+
+
 def read_points(path: Path, names: Sequence[str]) -> tuple[list[tuple[NDArray, NDArray]], list[int]]:
     """Of each frame pixels [n, 2] and descriptors [n, d] of its key points, and what the database calls its camera."""
     import pycolmap
@@ -187,12 +195,42 @@ def write_matches(
     with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
         for (i, j), rows in matches.items():
             db.write_matches(ids[i], ids[j], rows.astype(np.uint32))
+    _verify(path, [(flight.frames[i].name, flight.frames[j].name) for i, j in matches], seed)
+    return guessed
+
+
+def rewrite_matches(
+    path: Path, names: Sequence[str], matches: Mapping[tuple[int, int], NDArray[np.uint32] | None], *, seed: int
+) -> None:
+    """Put other matches of some pairs of frames into a database, verified; None or too few for that: the pair has none.
+
+    Args:
+        path: the database.
+        names: of its frames.
+        matches: for pairs (i, j), i < j, rows of indices of key points [m, 2].
+        seed: of the verification.
+    """
+    import pycolmap
+
+    kept = {pair: rows for pair, rows in matches.items() if rows is not None and len(rows)}
+    with pycolmap.Database.open(path) as db, pycolmap.DatabaseTransaction(db):
+        ids = [db.read_image_with_name(name).image_id for name in names]
+        for i, j in matches:
+            db.delete_two_view_geometry(ids[i], ids[j])
+            db.delete_matches(ids[i], ids[j])
+        for (i, j), rows in kept.items():
+            db.write_matches(ids[i], ids[j], rows.astype(np.uint32))
+    _verify(path, [(names[i], names[j]) for i, j in kept], seed)
+
+
+def _verify(path: Path, pairs: Sequence[tuple[str, str]], seed: int) -> None:
+    import pycolmap
+
     asked = path.with_suffix(".txt")
-    asked.write_text("".join(f"{flight.frames[i].name} {flight.frames[j].name}\n" for i, j in matches))
+    asked.write_text("".join(f"{first} {second}\n" for first, second in pairs))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     pycolmap.verify_matches(path, asked, verification)
-    return guessed
 
 
 def strongest_pair(path: Path) -> int:

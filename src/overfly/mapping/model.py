@@ -56,7 +56,7 @@ def mapped(
         return [(model, bundle) for model, bundle in pairs if len(bundle.points) >= FEWEST_MATCHES]
 
     def better(best: _Judged | None, models: dict[int, Any]) -> _Judged | None:
-        judged = [_Judged(model, bundle, _upheld(bundle, matches)) for model, bundle in bundled(models)]
+        judged = [_Judged(model, bundle, upheld(bundle, matches)) for model, bundle in bundled(models)]
         return max([m for m in (best, *judged) if m is not None], key=_Judged.worth, default=None)
 
     best = None
@@ -96,8 +96,13 @@ class _Judged(NamedTuple):
         return len(self.bundle) == images and self.upheld >= (1 - CONTRADICTED) * images
 
 
-def _upheld(bundle: Bundle, matches: Mapping[tuple[int, int], int]) -> int:
-    """How many images of a bundle keep their matches with its other images."""
+def upheld(bundle: Bundle, matches: Mapping[tuple[int, int], int]) -> int:
+    """How many images of a bundle keep their matches with its other images.
+
+    Args:
+        bundle: its ``frames`` are what the pairs speak of.
+        matches: of pairs i < j, how many.
+    """
     row = {frame: k for k, frame in enumerate(bundle.frames.tolist())}
     links = bundle.links()
     away = float(np.median(np.linalg.norm(bundle.points[bundle.point] - bundle.centres[bundle.image], axis=1)))

@@ -9,11 +9,12 @@ import numpy as np
 
 from overfly.flights import Flight
 from overfly.geometry import Array
+from overfly.mapping.agreement import agreement, rewritten
 from overfly.mapping.bundle import Bundle, components
-from overfly.mapping.by_priors import bundle_by_priors
-from overfly.mapping.database import read_points, read_verified
-from overfly.mapping.matches import Bar
-from overfly.mapping.model import mapped
+from overfly.mapping.by_priors import Verified, bundle_by_priors
+from overfly.mapping.database import read_points
+from overfly.mapping.matches import Bar, priors
+from overfly.mapping.model import CONTRADICTED, mapped, upheld
 from overfly.mapping.placing import agrees_with_gps
 
 ENOUGH = 0.95
@@ -40,9 +41,9 @@ def sparse_parts(
     """Bundles without common images, the largest first: with the focal lengths that the photos tell, if they tell them.
 
     Over flat ground a focal length without limits may run away, and everything with it; it is let go only where not
-    all images could be placed with the one that is told. Where matches are so few that sparse mapping leaves images
-    out or contradicts GPS, more of them are asked for; if these are too few as well, cameras start where GPS and
-    gimbals say that they are.
+    all images could be placed with the one that is told. Pairs whose matches contradict GPS and gimbals are left out.
+    Where matches are so few that sparse mapping leaves images out or contradicts GPS, more of them are asked for; if
+    these are too few as well, cameras start where GPS and gimbals say that they are.
 
     Args:
         database: of verified matches.
@@ -58,27 +59,54 @@ def sparse_parts(
     names = [frame.name for frame in flight.frames]
     calibrated = all(frame.calibration is not None for frame in flight.frames)
 
-    def found(folder: Path, calibrate: bool) -> list[Bundle]:
-        return mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
+    def built_up(database: Path, folder: Path) -> list[Bundle]:
+        def found(folder: Path, calibrate: bool) -> list[Bundle]:
+            return mapped(database, flight.root, folder, names=names, seed=seed, calibrate=calibrate)
 
-    def built_up(folder: Path) -> list[Bundle]:
         held = [] if len(guessed) == len(names) else found(folder / "held", calibrate=False)
         if (held and len(held[0]) == len(names)) or calibrated:
             return held
         free = found(folder, calibrate=True)
         return free if not held or (free and len(free[0]) > len(held[0])) else held
 
-    def judged(parts: list[Bundle]) -> tuple[bool, bool]:
-        """Whether parts agree with GPS, as far as it is known, and whether they are good enough."""
-        agree = bool(parts) and (told is None or agrees_with_gps(parts[0], told, flight.frames))
+    def judged(parts: list[Bundle], matches: Verified) -> tuple[bool, bool]:
+        """Whether parts agree with GPS and keep their matches, as far as GPS is known, and are good enough."""
+        if not parts or told is None:
+            return bool(parts), bool(parts) and len(parts[0]) >= ENOUGH * len(names)
+        kept = upheld(parts[0], {pair: len(rows) for pair, rows in matches.items()})
+        agree = kept >= (1 - CONTRADICTED) * len(parts[0]) and agrees_with_gps(parts[0], told, flight.frames)
         return agree, agree and len(parts[0]) >= ENOUGH * len(names)
 
-    best = built_up(workdir)
-    agrees, good = judged(best)
+    def started(database: Path, folder: Path) -> tuple[list[Bundle], Verified]:
+        """Models of matches that agree with the priors, and these matches."""
+        if told is None:
+            return built_up(database, folder), {}
+        found = agreement(database, names, priors(flight.frames, told), seed)
+        if found.dropped:
+            return built_up(rewritten(database, names, found, seed), folder), found.verified
+        best = built_up(database, folder)
+        if found.added and not judged(best, found.verified)[1]:
+            again = built_up(rewritten(database, names, found, seed), folder / "agreeing")
+            if again and (not best or judged(again, found.verified) > judged(best, found.verified)):
+                best = again
+        return best, found.verified
+
+    def from_priors(database: Path, matches: Verified) -> list[Bundle]:
+        assert told is not None
+        features, lens_ids = read_points(database, names)
+        with bar("guided matches", "pairs") as update:
+            prior = bundle_by_priors(
+            flight.frames, told, features, matches, lens_ids,
+            priors=priors(flight.frames, told), seed=seed, progress=update,
+        )  # fmt: skip
+        return [] if prior is None else components(prior)
+
+    best, matches = started(database, workdir)
+    agrees, good = judged(best, matches)
     if not good and more is not None:
         database = more()
-        richer = built_up(workdir / "more")
-        now_agrees, now_good = judged(richer)
+        richer, matches = started(database, workdir / "more")
+        now_agrees, now_good = judged(richer, matches)
         if richer and (not best or now_agrees > agrees or (now_agrees == agrees and _more_placed(richer[0], best[0]))):
             best, agrees, good = richer, now_agrees, now_good
             warnings.append(
@@ -90,8 +118,9 @@ def sparse_parts(
     features, lens_ids = read_points(database, names)
     with bar("guided matches", "pairs") as update:
         prior = bundle_by_priors(
-            flight.frames, told, features, read_verified(database, names), lens_ids, progress=update
-        )
+            flight.frames, told, features, matches, lens_ids,
+            priors=priors(flight.frames, told), seed=seed, progress=update,
+        )  # fmt: skip
     parts = [] if prior is None else components(prior)
     if not parts or (best and not _better(parts[0], best[0], agrees)):
         return best
@@ -100,7 +129,8 @@ def sparse_parts(
     tried = "" if more is None else ", also with the network's,"
     warnings.append(
         f"Matches were so few{tried} that sparse mapping {failed}: the cameras were started where GPS and gimbals say "
-        "that they are, and are only roughly held by the images. Fly with more overlap."
+        "that they are, with the matches that agree with that. Fly with more overlap, and look at the picture of the "
+        "block."
     )
     return parts
 
