@@ -48,6 +48,10 @@ corner to corner."""
 FLATTEST = 0.4
 """Cosine from nadir: of flatter images the nearer ground counts."""
 
+BY_CHANCE, DISPLACED = 0.25, (0.13, 0.17)
+"""Share of the matches along epipolar lines that may be found there by chance, or none is taken; and shares of an image
+by which its key points are moved to count these."""
+
 RELIEF = (0.02, 0.98, 0.5)
 """Shares of the points between whose heights the ground is looked for, and how much more, of their range, each way."""
 
@@ -182,10 +186,11 @@ def _first(
         had = rows.get((i, j), np.zeros((0, 2), np.uint32))
         if first is None or second is None or len(had) >= ENOUGH:
             continue
-        new = _guided(start, (i, j), features, heights, FIRST_REACH_PX * max(unit[i], unit[j]))
+        reach = FIRST_REACH_PX * max(unit[i], unit[j])
+        new = _guided(start, (i, j), features, heights, reach)
         both = np.unique(np.concatenate([had, new]), axis=0)
         pixels = features[i][0][both[:, 0]], features[j][0][both[:, 1]]
-        if (good := agreeing(first, second, pixels, seed)).sum() > len(had):
+        if (good := agreeing(first, second, pixels, seed, reach)).sum() > len(had):
             found[i, j] = both[good]
     return found
 
@@ -202,7 +207,9 @@ def _more(
     for done, (i, j) in enumerate(near):
         reach = (REACH_PX if seen[i] and seen[j] else FAR_REACH_PX) * max(unit[i], unit[j])
         new = _guided(bundle, (i, j), features, heights, reach)
-        if len(new):
+        if len(new) and len(
+            _guided(bundle, (i, j), _displaced(features, j, bundle), heights, reach)
+        ) <= BY_CHANCE * len(new):
             found[i, j] = np.unique(np.concatenate([rows.get((i, j), new[:0]), new]), axis=0)
         if progress:
             progress(done + 1, len(near))
@@ -236,6 +243,14 @@ def _guided(
     looks = features[pair[0]][1], features[pair[1]][1]
     pixels = features[pair[0]][0][: len(looks[0])], features[pair[1]][0][: len(looks[1])]
     return guided_matches(bundle, pair, pixels, looks, heights, reach)
+
+
+def _displaced(features: Sequence[Features], j: int, bundle: Bundle) -> list[Features]:
+    """The features, with the key points of image j where they are not: what is found there is found by chance."""
+    size = 2 * bundle.lenses[bundle.lens_of[j], 1:3]
+    moved = list(features)
+    moved[j] = (features[j][0] + DISPLACED * size) % size, features[j][1]
+    return moved
 
 
 def _tracks(pixels: Sequence[NDArray], rows: Verified) -> tuple[Index, Index, Array]:

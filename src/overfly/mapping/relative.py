@@ -56,13 +56,16 @@ class Pair(NamedTuple):
     height: float
 
 
-def agreeing(first: Prior, second: Prior, pixels: tuple[NDArray, NDArray], seed: int) -> NDArray[np.bool_]:
+def agreeing(
+    first: Prior, second: Prior, pixels: tuple[NDArray, NDArray], seed: int, reach: float = np.inf
+) -> NDArray[np.bool_]:
     """Which matches [m] agree with one pose near the priors; none where as many would by chance.
 
     Args:
         first, second: of the frames.
         pixels: of the matches, [m, 2] in each image.
         seed: of the draws.
+        reach: pixels off the epipolar lines of the priors within which matches were looked for.
     """
     pair = _pair(first, second, pixels)
     none = np.zeros(len(pixels[0]), bool)
@@ -78,7 +81,7 @@ def agreeing(first: Prior, second: Prior, pixels: tuple[NDArray, NDArray], seed:
     may = np.flatnonzero((np.abs(away[0]) < SIGMAS * room) & _above_ground(pair, sides, zero)[0])
     if len(may) < FEWEST:
         return none
-    chance = float(np.mean(np.minimum(1, WITHIN_PX * unit / (SIGMAS * room[may]))))
+    chance = float(np.mean(np.minimum(1, WITHIN_PX * unit / np.minimum(SIGMAS * room[may], reach))))
     rng = np.random.default_rng(seed)
     drawn = rng.random((HYPOTHESES, len(may))).argpartition(DRAWN - 1, axis=1)[:, :DRAWN]
     few = Pair(pair.base, (pair.rays[0][may], pair.rays[1][may]), *pair[2:])
