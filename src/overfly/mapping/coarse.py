@@ -63,8 +63,9 @@ def coarse_points(frames: Sequence[Frame], *, seed: int) -> Array:
     points = _standing(found, centres)
     if not len(points):
         raise InputError(
-            "No two neighbouring images match with the given cameras: check that the cameras belong to these images, "
-            "or map with --cameras estimate."
+            "No two neighbouring images match with these cameras: if they were given, check that they belong to these "
+            "images, or map with --cameras estimate; if they were estimated, the images share too little ground: give "
+            "sharp ones that overlap by 60 %."
         )
     ground, oblique = float(np.median(points[:, 2])), [is_oblique(pose) for pose in poses]
     if not any(oblique) or ground >= centres[:, 2].min():
