@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +83,45 @@ def test_nothing_is_held_against_priors_that_strong_pairs_contradict(block: Matc
     mine = [pair for pair in kept if 3 in pair and len(kept[pair])]
     assert len(mine) >= 2
     assert all(np.array_equal(found.verified[pair], kept[pair]) for pair in mine)
+
+
+@pytest.mark.parametrize("wrong", ["headings of a line", "all headings", "take-off", "focal length"])
+def test_priors_that_are_wrong_as_a_whole_drop_nothing(block: Matched, wrong: str) -> None:
+    """One line's compass reversed, or all; the take-off 60 m above the ground; a focal length of other images."""
+    stand = []
+    for k, (frame, place) in enumerate(zip(block.frames, block.told, strict=True)):
+        turned = wrong == "all headings" or (wrong == "headings of a line" and k < 4)
+        yaw, pitch, roll = frame.gimbal or (0, 0, 0)
+        lower = np.array([0, 0, 60.0 if wrong == "take-off" else 0.0])
+        camera = CAMERA if wrong != "focal length" else replace(CAMERA, fx=1500.0, fy=1500.0)
+        stand.append(Prior(camera, pose(rotation_from_gimbal(yaw + 180 * turned, pitch, roll), place - lower)))
+    found = agreement(block.database, block.names, stand, 0)
+    right = [pair for pair in found.dropped if pair not in (FALSE, WEAK)]
+    assert not right
+
+
+def test_a_hovering_drone_contradicts_nothing(tmp_path: Path) -> None:
+    """Two photos from one place: GPS does not tell in which direction one stands from the other."""
+    matched = Matched(tmp_path)
+    told = matched.told.copy()
+    told[1] = told[0] + [0.3, -0.2, 0.1]
+    found = agreement(matched.database, matched.names, matched.priors(told), 0)
+    assert (0, 1) not in found.dropped
+    kept = read_verified(matched.database, matched.names)
+    assert np.array_equal(found.verified[0, 1], kept[0, 1])
+
+
+def test_what_a_killed_run_left_does_not_reach_the_copy(block: Matched) -> None:
+    found = agreement(block.database, block.names, block.priors(block.told), 0)
+    first = rewritten(block.database, block.names, found, 0)
+    content = {pair: rows.tolist() for pair, rows in read_verified(first, block.names).items()}
+    with sqlite3.connect(first) as killed:
+        killed.execute("pragma journal_mode=wal")
+        killed.execute("delete from two_view_geometries")
+        killed.commit()
+        assert first.with_name(first.name + "-wal").is_file()
+        again = rewritten(block.database, block.names, found, 0)
+    assert {pair: rows.tolist() for pair, rows in read_verified(again, block.names).items()} == content
 
 
 def test_without_priors_matches_stay_as_they_were_verified(block: Matched) -> None:

@@ -72,7 +72,9 @@ def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_neede
     monkeypatch.setattr(sparse, "mapped", mapped)
     monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: agrees)
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
-    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], []))
+    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(20, bool)))
+    monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 20)
+    monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
     monkeypatch.setattr(sparse, "upheld", lambda part, _: len(part))
     monkeypatch.setattr(sparse, "bundle_by_priors", by_priors)
     monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
@@ -119,7 +121,9 @@ def test_more_matches_are_asked_for_where_they_are_too_few(
     )
     monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_: part.name != against)
     monkeypatch.setattr(sparse, "read_points", lambda database, _: (read.append(database.name), []))
-    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], []))
+    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(20, bool)))
+    monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 20)
+    monkeypatch.setattr(sparse, "read_verified", lambda *_: {})
     monkeypatch.setattr(sparse, "upheld", lambda part, _: len(part))
     monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: PRIOR)
     monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
@@ -140,3 +144,76 @@ def test_more_matches_are_asked_for_where_they_are_too_few(
     assert bool(asked) == (taken != "few")
     assert len(warnings) == told
     assert all("network" in warning for warning in warnings)  # whoever reads the report is told that it was asked
+
+
+@pytest.mark.parametrize(
+    ("dropped", "added", "as_they_are", "agreeing", "kept", "taken", "mapped_are"),
+    [
+        ([(0, 1)], [], HELD, Part("clean", 20), 20, "clean", ["m_agreeing.db"]),
+        ([(0, 1)], [], HELD, None, 20, "held", ["m_agreeing.db", "m.db"]),  # what was left out is needed
+        ([(0, 1)], [], Part("held", 12), Part("clean", 18), 20, "clean", ["m_agreeing.db", "m.db"]),
+        ([], [(0, 2)], HELD, Part("clean", 20), 20, "held", ["m.db"]),  # nothing more is needed
+        ([], [(0, 2)], Part("held", 12), Part("clean", 18), 20, "clean", ["m.db", "m_agreeing.db"]),
+        ([], [], HELD, None, 18, "held", ["m.db"]),  # loses matches of two images: the priors place no more
+        ([], [], HELD, None, 9, "prior", ["m.db"]),  # loses those of most: it is wrong
+    ],
+)
+def test_models_are_made_of_what_agrees_with_the_priors_and_must_keep_it(
+    dropped: list[tuple[int, int]],
+    added: list[tuple[int, int]],
+    as_they_are: Part | None,
+    agreeing: Part | None,
+    kept: int,
+    taken: str,
+    mapped_are: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+
+    def mapped(database: Path, *_: Any, **__: Any) -> list[Part]:
+        if database.name not in done:
+            done.append(database.name)
+        found = as_they_are if database.name == "m.db" else agreeing
+        return [] if found is None else [found]
+
+    def rewritten(*_: Any) -> Path:
+        (tmp_path / "m_agreeing.db").touch()
+        return tmp_path / "m_agreeing.db"
+
+    monkeypatch.setattr(sparse, "mapped", mapped)
+    monkeypatch.setattr(sparse, "rewritten", rewritten)
+    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, dropped, added, np.ones(20, bool)))
+    monkeypatch.setattr(sparse, "upheld", lambda part, _: min(kept, len(part)))
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: True)
+    monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 20)
+    monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
+    prior = PRIOR if kept < 20 else None
+    monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: prior)
+    monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
+    flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(20)])
+    parts: Any = sparse.sparse_parts(
+        tmp_path / "m.db", flight, [], np.zeros((20, 3)), tmp_path, 0,
+        lambda *_: nullcontext(lambda *_: None), [],
+    )  # fmt: skip
+    assert [part.name for part in parts] == [taken]
+    assert done == mapped_are
+    assert not (tmp_path / "m_agreeing.db").exists(), "the copy is not kept"
+
+
+@pytest.mark.parametrize(
+    ("new", "old", "agrees", "trusted", "taken"),
+    [
+        (19, 20, False, False, False),
+        (20, 20, False, False, True),
+        (10, 20, False, True, True),
+        (9, 20, False, True, False),
+        (20, 20, True, True, False),
+        (20, 19, True, False, True),
+    ],
+)
+def test_cameras_by_priors_replace_a_model_that_contradicts_gps(
+    new: int, old: int, agrees: bool, trusted: bool, taken: bool
+) -> None:
+    parts: Any = Part("new", new), Part("old", old)
+    assert sparse._better(*parts, agrees, trusted) == taken

@@ -5,7 +5,7 @@ Sparse mapping adds frame to frame, and each step needs many matches; what is kn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,13 +17,10 @@ from overfly.mapping.adjustment import adjusted
 from overfly.mapping.bundle import Bundle, Index
 from overfly.mapping.calibration import LOOSE, ROUGHLY, held_by_images
 from overfly.mapping.database import focal_px
-from overfly.mapping.guided import guided_matches
 from overfly.mapping.overlays import Prior
 from overfly.mapping.placing import gps_sigmas
-from overfly.mapping.relative import agreeing
-
-UNIT_PX = 800
-"""Longest side of an image to which the lengths below belong, in its pixels; larger ones have larger pixels' errors."""
+from overfly.mapping.prior_matches import Features, Verified, first_matches, more_matches
+from overfly.mapping.relative import UNIT_PX
 
 FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
 """What a ray is taken to be worth, pixels, one adjustment after another: at first directions are wrong by a degree."""
@@ -31,38 +28,11 @@ FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
 UP_SIGMA_DEG = 3.0
 """What the gimbal's vertical is taken to be worth: a few wrong matches shall not tilt an image."""
 
-REACH_PX, FAR_REACH_PX = 3.0, 40.0
-"""Off its epipolar line a key point is looked for so far, and so far if one of the images has no match yet."""
-
-FIRST_REACH_PX, FIRST_HEIGHTS = 60.0, (-0.15, 0.3)
-"""Off its epipolar line, and between which heights over the ground, in the cameras' heights over it, a key point is
-looked for before any camera is adjusted."""
-
-ENOUGH = 15
-"""Matches of a pair from which on nothing more is looked for by then."""
-
-FOOTPRINTS_APART, NEAREST = 1.2, 8
-"""Images are compared with so many whose middles lie nearest, no farther than so many times the ground that one sees,
-corner to corner."""
-
-FLATTEST = 0.4
-"""Cosine from nadir: of flatter images the nearer ground counts."""
-
-BY_CHANCE, DISPLACED = 0.25, (0.13, 0.17)
-"""Share of the matches along epipolar lines that may be found there by chance, or none is taken; and shares of an image
-by which its key points are moved to count these."""
-
-RELIEF = (0.02, 0.98, 0.5)
-"""Shares of the points between whose heights the ground is looked for, and how much more, of their range, each way."""
-
 FEWEST_RAYS = 8
 """Rays without which an image is not placed: three tell its pose, the others that they are right."""
 
 FARTHEST_PX = 6.0
 """Rays that miss their point by more at the end are dropped."""
-
-Features = tuple[NDArray, NDArray]
-Verified = Mapping[tuple[int, int], NDArray[np.uint32]]
 
 
 def bundle_by_priors(
@@ -118,7 +88,9 @@ def bundle_by_priors(
         pixels=np.zeros((0, 2)),
     )
     places, sigmas = told[known], gps_sigmas([frames[i] for i in known]) * LOOSE
-    rows = _first(start, own, rows, [priors[i] for i in known] if len(priors) else [None] * len(known), seed)
+    rows = first_matches(
+        start, own, rows, [priors[i] for i in known] if len(priors) else [None] * len(known), seed, progress
+    )
     if not rows:
         return None
     ups = start.rotations[:, :, 2]
@@ -132,7 +104,7 @@ def bundle_by_priors(
         rotations=np.where(seen[:, None, None], bundle.rotations, start.rotations),
         centres=np.where(seen[:, None], bundle.centres, start.centres + shift),
     )
-    bundle = _fitted(bundle, own, _more(bundle, own, rows, progress), frames, places, sigmas, ups, SIGMAS_PX)
+    bundle = _fitted(bundle, own, more_matches(bundle, own, rows, progress), frames, places, sigmas, ups, SIGMAS_PX)
     while len(bundle) and (few := np.bincount(bundle.image, minlength=len(bundle)) < FEWEST_RAYS).any():
         bundle = bundle.without(few)
     return bundle if len(bundle) >= 2 else None
@@ -168,89 +140,6 @@ def _fitted(
         bundle = adjusted(bundle, held, tolerance=ROUGHLY).bundle
         bundle = bundle.kept(bundle.errors() < max(unit * FARTHEST_PX, 4 * sigma))
     return bundle.kept(bundle.errors() < unit * FARTHEST_PX)
-
-
-def _first(
-    start: Bundle, features: Sequence[Features], rows: Verified, priors: Sequence[Prior | None], seed: int
-) -> Verified:
-    """The matches, and of pairs with few those that agree with the priors among what is alike where these put it."""
-    above = [p.world_from_camera[2, 3] for p in priors if p is not None]
-    if not above:
-        return rows
-    tops = [z - p.world_from_camera[2, 3] for z, p in zip(start.centres[:, 2], priors, strict=True) if p is not None]
-    level, height = float(np.median(tops)), float(np.median(above))
-    heights = level + FIRST_HEIGHTS[0] * height, level + FIRST_HEIGHTS[1] * height
-    unit, found = _unit(start), dict(rows)
-    for i, j in _near(start, level):
-        first, second = priors[i], priors[j]
-        had = rows.get((i, j), np.zeros((0, 2), np.uint32))
-        if first is None or second is None or len(had) >= ENOUGH:
-            continue
-        reach = FIRST_REACH_PX * max(unit[i], unit[j])
-        new = _guided(start, (i, j), features, heights, reach)
-        both = np.unique(np.concatenate([had, new]), axis=0)
-        pixels = features[i][0][both[:, 0]], features[j][0][both[:, 1]]
-        if (good := agreeing(first, second, pixels, seed, reach)).sum() > len(had):
-            found[i, j] = both[good]
-    return found
-
-
-def _more(
-    bundle: Bundle, features: Sequence[Features], rows: Verified, progress: Callable[[int, int], None] | None
-) -> Verified:
-    """The matches and those that the cameras' poses lead to."""
-    least, most, more = RELIEF
-    low, high = np.quantile(bundle.points[:, 2], [least, most])
-    heights = float(low - more * (high - low)), float(high + more * (high - low))
-    seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
-    unit, near, found = _unit(bundle), _near(bundle, float(low)), dict(rows)
-    for done, (i, j) in enumerate(near):
-        reach = (REACH_PX if seen[i] and seen[j] else FAR_REACH_PX) * max(unit[i], unit[j])
-        new = _guided(bundle, (i, j), features, heights, reach)
-        if len(new) and len(
-            _guided(bundle, (i, j), _displaced(features, j, bundle), heights, reach)
-        ) <= BY_CHANCE * len(new):
-            found[i, j] = np.unique(np.concatenate([rows.get((i, j), new[:0]), new]), axis=0)
-        if progress:
-            progress(done + 1, len(near))
-    return found
-
-
-def _unit(bundle: Bundle) -> Array:
-    """Pixels [n] of each image in those of :data:`UNIT_PX`."""
-    return np.maximum(1.0, 2 * bundle.lenses[bundle.lens_of, 1:3].max(1) / UNIT_PX)
-
-
-def _near(bundle: Bundle, ground: float) -> list[tuple[int, int]]:
-    """Pairs i < j of images that may see common ground at a height: what is in their middles lies near."""
-    corner = np.linalg.norm(bundle.lenses[bundle.lens_of, 1:3], axis=1) / bundle.lenses[bundle.lens_of, 0]
-    above = np.maximum(bundle.centres[:, 2] - ground, 0)
-    ahead = bundle.rotations[:, 2]
-    middle = bundle.centres[:, :2] + ahead[:, :2] / np.maximum(-ahead[:, 2:], FLATTEST) * above[:, None]
-    near: set[tuple[int, int]] = set()
-    for i in range(len(bundle)):
-        away = np.linalg.norm(middle - middle[i], axis=1)
-        away[i] = np.inf
-        partners = np.argsort(away, kind="stable")[:NEAREST]
-        partners = partners[away[partners] < FOOTPRINTS_APART * 2 * corner[i] * above[i]]
-        near |= {(min(i, j), max(i, j)) for j in partners.tolist()}
-    return sorted(near)
-
-
-def _guided(
-    bundle: Bundle, pair: tuple[int, int], features: Sequence[Features], heights: tuple[float, float], reach: float
-) -> NDArray[np.uint32]:
-    looks = features[pair[0]][1], features[pair[1]][1]
-    pixels = features[pair[0]][0][: len(looks[0])], features[pair[1]][0][: len(looks[1])]
-    return guided_matches(bundle, pair, pixels, looks, heights, reach)
-
-
-def _displaced(features: Sequence[Features], j: int, bundle: Bundle) -> list[Features]:
-    """The features, with the key points of image j where they are not: what is found there is found by chance."""
-    size = 2 * bundle.lenses[bundle.lens_of[j], 1:3]
-    moved = list(features)
-    moved[j] = (features[j][0] + DISPLACED * size) % size, features[j][1]
-    return moved
 
 
 def _tracks(pixels: Sequence[NDArray], rows: Verified) -> tuple[Index, Index, Array]:

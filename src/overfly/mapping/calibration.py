@@ -46,8 +46,8 @@ GAIN = 0.01
 """Share of the cost that the images must gain by a lens, or by another focal length than the photos' data tell."""
 
 FARTHEST = 0.25
-"""Share by which a focal length is other than the photos tell only where all images share points with two others at
-once: else GPS alone tells how far apart cameras stand, and the focal length bends to its errors."""
+"""Share by which a focal length is other than the photos tell only where all images of the camera share points with two
+others at once: else GPS alone tells how far apart they stand, and the focal length bends to its errors."""
 
 NO_LENS_SIGMA = 0.0001
 """Standard deviation of k1 and k2 until the images ask for a lens."""
@@ -136,10 +136,11 @@ def calibrated(result: Adjusted) -> tuple[Adjusted, bool]:
         if np.bincount(result.bundle.lens_of).min() >= FEWEST_TO_FREE and rays >= FEWEST_RAYS_TO_FREE:
             free_focal = replace(result.held, focals=np.full_like(result.held.focals, np.nan))
             focal = adjusted(result.bundle, free_focal, lever=start, tolerance=hopeless, patience=PATIENCE)
-            off = np.abs(focal.bundle.lenses[:, 0] / result.held.focals - 1)
-            loose = bool((off > FARTHEST).any()) and untied(result.bundle).any()
-            if result.cost - focal.cost > needed and not loose:
-                result, untold = focal, False
+            if result.cost - focal.cost > needed:
+                far = np.abs(focal.bundle.lenses[:, 0] / result.held.focals - 1) > FARTHEST
+                loose = np.bincount(result.bundle.lens_of[untied(result.bundle)], minlength=len(far)) > 0
+                untold = bool((far & loose).any())
+                result = result if untold else focal
     return adjusted(result.bundle, result.held, lever=result.lever), untold
 
 

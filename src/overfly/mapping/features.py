@@ -37,14 +37,16 @@ def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[n
     import cv2
 
     kept = folder / f"{frame.name.replace('/', '_')}.npz"
+    focal = focal_px(frame)
+    seen_as = np.array([np.nan] * 4 if frame.gimbal is None or focal is None else [*frame.gimbal, focal])
     if kept.is_file():
         with np.load(kept) as data:
-            return data["pixels"], data["descriptors"]
+            if np.array_equal(data["seen_as"], seen_as, equal_nan=True):
+                return data["pixels"], data["descriptors"]
     gray = cv2.cvtColor(frame.image(), cv2.COLOR_RGB2GRAY)
     factor = min(1.0, LONGEST_SIDE / max(gray.shape))
     if factor < 1:
         gray = cv2.resize(gray, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
-    focal = focal_px(frame)
     down = None if frame.gimbal is None or focal is None else nadir_view(gray, frame.gimbal, focal * factor)
     # A low contrast threshold: meadows and asphalt have key points too, and the strongest are chosen anyway.
     sift = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02, enable_precise_upscale=True)
@@ -59,7 +61,7 @@ def features(frame: Frame, folder: Path) -> tuple[NDArray[np.float32], NDArray[n
         pixels, descriptors = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8)
     part = kept.with_suffix(".part")
     with part.open("wb") as file:
-        np.savez(file, pixels=pixels, descriptors=descriptors)
+        np.savez(file, pixels=pixels, descriptors=descriptors, seen_as=seen_as)
     part.replace(kept)
     return pixels, descriptors
 

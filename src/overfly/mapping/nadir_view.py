@@ -19,7 +19,7 @@ LEAST_TILT_DEG = 15.0
 """From nadir: images tilted by less are alike as they are (by 10 degrees: 4 % fewer right matches with a view)."""
 
 STEEPEST_DEG = 65.0
-"""From nadir: what is seen at a flatter angle is left out, it is mostly stretched pixels."""
+"""From nadir: the view ends about there. Farther ground is mostly stretched pixels, and has no key points."""
 
 LARGEST = 4.0
 """Most pixels of a view in those of the image."""

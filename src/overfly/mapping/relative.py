@@ -25,17 +25,21 @@ GPS_M = (3.0, 5.0)
 SIGMAS = 3.0
 """Matches farther than so many standard deviations off where the priors put them are wrong."""
 
-HEIGHTS = (-0.3, 0.5)
-"""Heights between which the ground and what stands on it lie, in the cameras' heights over it."""
+DEPTHS = (0.4, 2.0)
+"""Depths below the first camera, in its height over the take-off, at which ground and what stands on it may lie: drones
+take off from hills and in valleys."""
+
+SHORTEST = 2.0
+"""Standard deviations of the two positions' distance: of shorter bases not even the direction is told."""
 
 WITHIN_PX, UNIT_PX = 2.0, 800
 """Off the epipolar line of an agreeing match, pixels of an image with that longest side; larger ones in proportion."""
 
-DRAWN, HYPOTHESES, STEPS = 3, 400, 3
-"""Matches of a hypothesis, how many are tried, and Gauss-Newton steps of each."""
+DRAWN, HYPOTHESES, STEPS, SCORED = 3, 400, 3, 300
+"""Matches of a hypothesis, how many are tried, Gauss-Newton steps of each, and most matches that choose the best."""
 
 FEWEST, BY_CHANCE = 6, 1e-2
-"""Matches that must agree, and flights' pairs in which as many would agree by chance."""
+"""Matches that must agree, and in what share of the pairs with wrong matches alone as many may."""
 
 
 class Pair(NamedTuple):
@@ -43,17 +47,32 @@ class Pair(NamedTuple):
 
     Attributes:
         base: [3] from the first camera to the second, metres.
+        sides: [2, 3] unit vectors across it, the first level.
+        spread: [5] standard deviations of the second camera's turn about x, y, z, radians, and of the base along the
+            sides, metres.
         rays: two of [m, 3], depth 1.
         rotations: world_from_camera [3, 3] of both.
-        focals: of both, pixels.
-        height: of the cameras over the ground, metres.
+        focals: of both, in pixels of images of :data:`UNIT_PX`.
+        height: of the first camera over the take-off, metres.
     """
 
     base: Array
+    sides: Array
+    spread: Array
     rays: tuple[Array, Array]
     rotations: tuple[Array, Array]
     focals: tuple[float, float]
     height: float
+
+    def of(self, chosen: NDArray) -> Pair:
+        """The pair with some of its matches."""
+        return self._replace(rays=(self.rays[0][chosen], self.rays[1][chosen]))
+
+
+def judged(first: Prior, second: Prior) -> bool:
+    """Whether the priors tell the direction of the base: those of copies and of a drone that hovers do not."""
+    base = second.world_from_camera[:3, 3] - first.world_from_camera[:3, 3]
+    return float(np.linalg.norm(base)) >= SHORTEST * np.sqrt(2) * GPS_M[0]
 
 
 def agreeing(
@@ -62,61 +81,65 @@ def agreeing(
     """Which matches [m] agree with one pose near the priors; none where as many would by chance.
 
     Args:
-        first, second: of the frames.
+        first, second: of the frames; pairs that are not :func:`judged` agree on nothing.
         pixels: of the matches, [m, 2] in each image.
         seed: of the draws.
-        reach: pixels off the epipolar lines of the priors within which matches were looked for.
+        reach: pixels of images of :data:`UNIT_PX` off the epipolar lines of the priors within which matches were
+            looked for.
     """
+    agree = np.zeros(len(pixels[0]), bool)
+    if not judged(first, second):
+        return agree
     pair = _pair(first, second, pixels)
-    none = np.zeros(len(pixels[0]), bool)
-    length = float(np.linalg.norm(pair.base))
-    if length < 0.01 * pair.height:
-        return none
-    unit = max(1.0, max(max(p.camera.width, p.camera.height) for p in (first, second)) / UNIT_PX)
-    sides = _across(pair.base)
-    spread = _spread(pair.base, sides)
-    zero = np.zeros((1, 5))
-    away, slope = _residuals(pair, sides, zero)
-    room = np.sqrt(unit**2 + (slope[0] ** 2 @ spread**2))  # one standard deviation, pixels
-    may = np.flatnonzero((np.abs(away[0]) < SIGMAS * room) & _above_ground(pair, sides, zero)[0])
-    if len(may) < FEWEST:
-        return none
-    chance = float(np.mean(np.minimum(1, WITHIN_PX * unit / np.minimum(SIGMAS * room[may], reach))))
+    prior = np.zeros((1, 5))
+    away, slope = _residuals(pair, prior)
+    sigma = np.sqrt(1 + slope[0] ** 2 @ pair.spread**2)  # of each match, pixels
+    near = np.flatnonzero((np.abs(away[0]) < SIGMAS * sigma) & _on_ground(pair, prior)[0])
+    if len(near) < FEWEST:
+        return agree
+    chance = float(np.mean(np.minimum(1, WITHIN_PX / np.minimum(SIGMAS * sigma[near], reach))))
     rng = np.random.default_rng(seed)
-    drawn = rng.random((HYPOTHESES, len(may))).argpartition(DRAWN - 1, axis=1)[:, :DRAWN]
-    few = Pair(pair.base, (pair.rays[0][may], pair.rays[1][may]), *pair[2:])
+    pair = pair.of(near)
+    some = pair if len(near) <= SCORED else pair.of(np.sort(rng.permutation(len(near))[:SCORED]))
+    count = len(some.rays[0])
+    drawn = rng.random((HYPOTHESES, count)).argpartition(DRAWN - 1, axis=1)[:, :DRAWN]
     moved = np.zeros((HYPOTHESES, 5))
     for _ in range(STEPS):
-        moved = _solved(few, sides, spread, moved, drawn, unit)
-    fits = _fits(few, sides, moved, unit)
-    best = int(fits.sum(1).argmax())
-    agree = fits[best]
+        moved = _solved(some, moved, drawn)
+    best = int(_fits(some, moved).sum(1).argmax())
+    moved = moved[best : best + 1]
+    fits = _fits(pair, moved)[0]
     for _ in range(STEPS):
-        if agree.sum() < DRAWN:
-            return none
-        refined = _solved(few, sides, spread, moved[best : best + 1], np.flatnonzero(agree)[None], unit)
-        again = _fits(few, sides, refined, unit)[0]
-        if again.sum() < agree.sum():
+        if fits.sum() < DRAWN:
+            return agree
+        refined = _solved(pair, moved, np.flatnonzero(fits)[None])
+        again = _fits(pair, refined)[0]
+        if again.sum() < fits.sum():
             break
-        agree, moved[best] = again, refined[0]
-    if agree.sum() < FEWEST or _log_false_alarms(len(may), int(agree.sum()), chance) > math.log(BY_CHANCE):
-        return none
-    none[may[agree]] = True
-    return none
+        fits, moved = again, refined
+    if fits.sum() >= FEWEST and _log_false_alarms(len(near), int(fits.sum()), chance) <= math.log(BY_CHANCE):
+        agree[near[fits]] = True
+    return agree
 
 
 def _pair(first: Prior, second: Prior, pixels: tuple[NDArray, NDArray]) -> Pair:
-    poses = first.world_from_camera, second.world_from_camera
+    """The pair of two priors and of the pixels [m, 2] of their matches."""
+    priors = first, second
     rays = []
-    for prior, pose, at in zip((first, second), poses, pixels, strict=True):
+    for prior, at in zip(priors, pixels, strict=True):
         local = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(prior.camera.matrix()).T
-        rays.append(local @ pose[:3, :3].T)
+        rays.append(local @ prior.world_from_camera[:3, :3].T)
+    units = [max(1.0, max(prior.camera.width, prior.camera.height) / UNIT_PX) for prior in priors]
+    base = second.world_from_camera[:3, 3] - first.world_from_camera[:3, 3]
+    sides = _across(base)
     return Pair(
-        poses[1][:3, 3] - poses[0][:3, 3],
+        base,
+        sides,
+        _spread(base, sides),
         (rays[0], rays[1]),
-        (poses[0][:3, :3], poses[1][:3, :3]),
-        (first.camera.fx, second.camera.fx),
-        float(np.mean([pose[2, 3] for pose in poses])),
+        (first.world_from_camera[:3, :3], second.world_from_camera[:3, :3]),
+        (first.camera.fx / units[0], second.camera.fx / units[1]),
+        float(first.world_from_camera[2, 3]),
     )
 
 
@@ -131,67 +154,68 @@ def _across(base: Array) -> Array:
 
 
 def _spread(base: Array, sides: Array) -> Array:
-    """Standard deviations [5] of a turn of the second camera about x, y, z, radians, and of the base across it, m."""
-    length = np.linalg.norm(base)
+    """Standard deviations [5] as in :class:`Pair`: of the gimbals, and of the base by GPS and the first gimbal."""
     turns = np.radians([TILT_DEG, TILT_DEG, YAW_DEG])
-    place = np.sqrt(2) * np.array([GPS_M[0], np.hypot(GPS_M[0] * sides[1, :2].max(), GPS_M[1] * sides[1, 2])])
-    return np.concatenate([turns, np.hypot(place, length * turns[[2, 0]])])
+    flat = np.linalg.norm(sides[:, :2], axis=1)
+    place = np.sqrt(2) * np.hypot(GPS_M[0] * flat, GPS_M[1] * sides[:, 2])
+    turned = np.array([turns[2] * np.linalg.norm(base[:2]), turns[0] * np.linalg.norm(base)])
+    return np.concatenate([turns, np.hypot(place, turned)])
 
 
 def _turned(moved: Array, rays: Array) -> Array:
-    """Rays [h, m, 3] of [m, 3] or [h, m, 3] turned by rotation vectors moved[:, :3]."""
+    """Rays [m, 3] or [h, m, 3] turned by rotation vectors moved[:, :3]: [h, m, 3]."""
     from scipy.spatial.transform import Rotation
 
-    return np.einsum(
-        "hij,...mj->hmi" if rays.ndim == 2 else "hij,hmj->hmi", Rotation.from_rotvec(moved[:, :3]).as_matrix(), rays
-    )
+    matrices = Rotation.from_rotvec(moved[:, :3]).as_matrix()
+    return np.asarray(np.einsum("hij,mj->hmi" if rays.ndim == 2 else "hij,hmj->hmi", matrices, rays))
 
 
-def _residuals(pair: Pair, sides: Array, moved: Array, drawn: NDArray | None = None) -> tuple[Array, Array]:
+def _residuals(pair: Pair, moved: Array, drawn: NDArray | None = None) -> tuple[Array, Array]:
     """Distances [h, m] from epipolar lines, pixels, and their derivatives [h, m, 5], for hypotheses moved [h, 5].
 
     Sampson's distance (Hartley & Zisserman 2004, eq. 11.9), of all matches or of those drawn [h, m].
     """
-    a, b = (x if drawn is None else x[drawn] for x in pair.rays)
+    a, b = (rays if drawn is None else rays[drawn] for rays in pair.rays)
     a = np.broadcast_to(a, (len(moved), *a.shape[-2:]))
     b = _turned(moved, b)
-    base = (pair.base + moved[:, 3:] @ sides)[:, None]
-    plane = np.cross(base, a)
-    other = np.cross(b, base)
+    base = (pair.base + moved[:, 3:] @ pair.sides)[:, None]
+    plane, other = np.cross(base, a), np.cross(b, base)
     error = (b * plane).sum(-1)
     grow = np.stack([np.linalg.norm((plane @ pair.rotations[1])[..., :2], axis=-1) / pair.focals[1],
                      np.linalg.norm((other @ pair.rotations[0])[..., :2], axis=-1) / pair.focals[0]])  # fmt: skip
     scale = 1 / np.maximum(np.sqrt((grow**2).sum(0)), 1e-12)
-    slope = np.concatenate([np.cross(b, plane), np.cross(a, b) @ sides.T], axis=-1)
+    slope = np.concatenate([np.cross(b, plane), np.cross(a, b) @ pair.sides.T], axis=-1)
     return error * scale, slope * scale[..., None]
 
 
-def _above_ground(pair: Pair, sides: Array, moved: Array) -> NDArray[np.bool_]:
-    """Whether matches [h, m] meet before both cameras, where ground can be."""
+def _on_ground(pair: Pair, moved: Array) -> NDArray[np.bool_]:
+    """Whether matches [h, m] meet before both cameras, at depths where ground can be, unsure as the base is long."""
     a = np.broadcast_to(pair.rays[0], (len(moved), *pair.rays[0].shape))
     b = _turned(moved, pair.rays[1])
-    base = (pair.base + moved[:, 3:] @ sides)[:, None]
+    base = (pair.base + moved[:, 3:] @ pair.sides)[:, None]
     # The depths s, t at which s a and base + t b are nearest.
     aa, bb, ab = (a * a).sum(-1), (b * b).sum(-1), (a * b).sum(-1)
     da, db = (a * base).sum(-1), (b * base).sum(-1)
     det = np.maximum(aa * bb - ab**2, 1e-12)
     s, t = (bb * da - ab * db) / det, (ab * da - aa * db) / det
-    height = 1 + s * a[..., 2] / pair.height
-    return (s > 0) & (t > 0) & (height > HEIGHTS[0]) & (height < HEIGHTS[1])
+    depth = -s * a[..., 2] / pair.height
+    unsure = SIGMAS * np.sqrt(2) * GPS_M[0] / np.linalg.norm(pair.base)
+    low, high = DEPTHS[0] * max(0.0, 1 - unsure), DEPTHS[1] * (1 + unsure)
+    return np.asarray((s > 0) & (t > 0) & (depth > low) & (depth < high))
 
 
-def _solved(pair: Pair, sides: Array, spread: Array, moved: Array, drawn: NDArray, unit: float) -> Array:
+def _solved(pair: Pair, moved: Array, drawn: NDArray) -> Array:
     """Hypotheses [h, 5] after a Gauss-Newton step towards their matches [h, k], held by the priors."""
-    away, slope = _residuals(pair, sides, moved, drawn)
-    normal = np.einsum("hki,hkj->hij", slope, slope) / unit**2 + np.diag(spread**-2.0)
-    right = np.einsum("hki,hk->hi", slope, away) / unit**2 + moved * spread**-2.0
-    return moved - np.linalg.solve(normal, right[..., None])[..., 0]
+    away, slope = _residuals(pair, moved, drawn)
+    weight = pair.spread**-2.0
+    normal = np.einsum("hki,hkj->hij", slope, slope) + np.diag(weight)
+    right = np.einsum("hki,hk->hi", slope, away) + moved * weight
+    return np.asarray(moved - np.linalg.solve(normal, right[..., None])[..., 0])
 
 
-def _fits(pair: Pair, sides: Array, moved: Array, unit: float) -> NDArray[np.bool_]:
+def _fits(pair: Pair, moved: Array) -> NDArray[np.bool_]:
     """Which matches [h, m] hypotheses explain."""
-    away, _ = _residuals(pair, sides, moved)
-    return (np.abs(away) < WITHIN_PX * unit) & _above_ground(pair, sides, moved)
+    return (np.abs(_residuals(pair, moved)[0]) < WITHIN_PX) & _on_ground(pair, moved)
 
 
 def _log_false_alarms(n: int, k: int, chance: float) -> float:
