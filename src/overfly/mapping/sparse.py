@@ -27,8 +27,8 @@ MOST = 0.8
 """Share of a model's images that must keep the matches that agree with GPS and gimbals, or it agrees with neither."""
 
 TRUSTED, FEWER = 0.5, 0.5
-"""Share of the images whose priors matches agree with, from which on cameras by priors are taken instead of a model that
-contradicts GPS, if they are at least so many times as many."""
+"""Share of the images whose priors matches agree with, from which on cameras by priors replace a model that contradicts
+GPS, if they are at least so many times as many."""
 
 WORSE = 2.0
 """Times by which reprojection errors may be larger where more images are placed."""
