@@ -67,7 +67,7 @@ def test_wrong_matches_alone_do_not_agree(kind: str) -> None:
         turned[:3, :3] @= Rotation.from_euler("y", 20, degrees=True).as_matrix()
         ends = seen_by_both((true, turned), 40, rng)
         shares.append(agreeing(told, also, ends, seed).mean())
-    assert np.mean(shares) < 0.5  # what supports a pair
+    assert np.mean(shares) < 0.45  # half of them support a pair
 
 
 @pytest.mark.parametrize(("first", "second"), [(60.0, 140.0), (140.0, 60.0), (100.0, 100.0)])

@@ -38,6 +38,10 @@ WITHIN_PX, UNIT_PX = 2.0, 800
 DRAWN, HYPOTHESES, STEPS, SCORED = 3, 400, 3, 300
 """Matches of a hypothesis, how many are tried, Gauss-Newton steps of each, and most matches that choose the best."""
 
+CLEAR, NARROWED_PX = 0.8, (np.inf, 30.0, 10.0, 4.0)
+"""Share of the matches near the priors with which nothing needs to be drawn, and from which distances on matches are
+left out on the way to the pose that most agree with."""
+
 FEWEST, BY_CHANCE = 6, 1e-2
 """Matches that must agree, and in what share of the pairs with wrong matches alone as many may."""
 
@@ -98,16 +102,10 @@ def agreeing(
     if len(near) < FEWEST:
         return agree
     chance = float(np.mean(np.minimum(1, WITHIN_PX / np.minimum(SIGMAS * sigma[near], reach))))
-    rng = np.random.default_rng(seed)
     pair = pair.of(near)
-    some = pair if len(near) <= SCORED else pair.of(np.sort(rng.permutation(len(near))[:SCORED]))
-    count = len(some.rays[0])
-    drawn = rng.random((HYPOTHESES, count)).argpartition(DRAWN - 1, axis=1)[:, :DRAWN]
-    moved = np.zeros((HYPOTHESES, 5))
-    for _ in range(STEPS):
-        moved = _solved(some, moved, drawn)
-    best = int(_fits(some, moved).sum(1).argmax())
-    moved = moved[best : best + 1]
+    moved = _narrowed(pair)
+    if _fits(pair, moved).mean() < CLEAR:
+        moved = _drawn(pair, np.random.default_rng(seed))
     fits = _fits(pair, moved)[0]
     for _ in range(STEPS):
         if fits.sum() < DRAWN:
@@ -120,6 +118,28 @@ def agreeing(
     if fits.sum() >= FEWEST and _log_false_alarms(len(near), int(fits.sum()), chance) <= math.log(BY_CHANCE):
         agree[near[fits]] = True
     return agree
+
+
+def _narrowed(pair: Pair) -> Array:
+    """The hypothesis [1, 5] that all matches lead to, step by step without those that lie far off."""
+    moved = np.zeros((1, 5))
+    for limit in NARROWED_PX:
+        close = (np.abs(_residuals(pair, moved)[0][0]) < limit) & _on_ground(pair, moved)[0]
+        moved = _solved(pair, moved, np.flatnonzero(close)[None])
+    return moved
+
+
+def _drawn(pair: Pair, rng: np.random.Generator) -> Array:
+    """The hypothesis [1, 5], of those to which a few matches lead, that most matches agree with."""
+    count = len(pair.rays[0])
+    some = pair if count <= SCORED else pair.of(np.sort(rng.permutation(count)[:SCORED]))
+    count = min(count, SCORED)
+    drawn = rng.random((HYPOTHESES, count)).argpartition(DRAWN - 1, axis=1)[:, :DRAWN]
+    moved = np.zeros((HYPOTHESES, 5))
+    for _ in range(STEPS):
+        moved = _solved(some, moved, drawn)
+    best = int(_fits(some, moved).sum(1).argmax())
+    return moved[best : best + 1]
 
 
 def _pair(first: Prior, second: Prior, pixels: tuple[NDArray, NDArray]) -> Pair:
@@ -214,8 +234,9 @@ def _solved(pair: Pair, moved: Array, drawn: NDArray) -> Array:
 
 
 def _fits(pair: Pair, moved: Array) -> NDArray[np.bool_]:
-    """Which matches [h, m] hypotheses explain."""
-    return (np.abs(_residuals(pair, moved)[0]) < WITHIN_PX) & _on_ground(pair, moved)
+    """Which matches [h, m] hypotheses explain; those that many matches have drawn away from the priors explain none."""
+    near = np.asarray((np.abs(moved) < SIGMAS * pair.spread).all(1))[:, None]
+    return near & (np.abs(_residuals(pair, moved)[0]) < WITHIN_PX) & _on_ground(pair, moved)
 
 
 def _log_false_alarms(n: int, k: int, chance: float) -> float:
