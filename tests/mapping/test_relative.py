@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from overfly.geometry import Camera, pose, project, rotation_from_gimbal
 from overfly.mapping.overlays import Prior
-from overfly.mapping.relative import _pair, _residuals, agreeing, judged
+from overfly.mapping.relative import _pair, _residuals, agreeing, comparable
 
 CAMERA = Camera(800, 600, 600.0, 600.0, 400.0, 300.0)
 
@@ -102,7 +102,7 @@ def test_copies_and_lonely_matches_agree_on_nothing() -> None:
     rng = np.random.default_rng(0)
     true, told = looking(0.0, -90.0, (0.0, 0.0, 100.0), rng)
     ends = seen_by_both((true, true), 40, rng)
-    assert not judged(told, told)
+    assert not comparable(told, told)
     assert not agreeing(told, told, ends, 0).any(), "without a base nothing is told"
     none = np.zeros((0, 2))
     other = looking(0.0, -90.0, (40.0, 0.0, 100.0), rng)[1]

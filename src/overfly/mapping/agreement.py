@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.mapping.database import read_matches, read_pixels, read_verified, rewrite_matches
+from overfly.mapping.model import FEWEST_MATCHES
 from overfly.mapping.overlays import Prior
-from overfly.mapping.relative import agreeing, judged
+from overfly.mapping.relative import agreeing, comparable
 
 STRONG, STRONG_SHARE = 50, 0.5
 """Verified matches, and their share of all, of pairs that are right beyond doubt: they judge the priors."""
@@ -28,9 +29,6 @@ SUPPORTED = 0.5
 
 BELIEVED = 0.7
 """Share of a frame's strong pairs, and of the flight's, that must be supported, or no match is held against priors."""
-
-ENOUGH = 15
-"""Matches of a pair that COLMAP's verification takes, too."""
 
 Matches = dict[tuple[int, int], NDArray[np.uint32]]
 
@@ -56,7 +54,7 @@ class Agreement(NamedTuple):
         return {
             pair: len(rows)
             for pair, rows in self.verified.items()
-            if len(rows) >= ENOUGH and self.believed[list(pair)].all()
+            if len(rows) >= FEWEST_MATCHES and self.believed[list(pair)].all()
         }
 
 
@@ -84,7 +82,7 @@ def agreement(
     agree = Matches()
     for done, ((i, j), rows) in enumerate(raw.items()):
         first, second = priors[i], priors[j]
-        if first is not None and second is not None and len(rows) and judged(first, second):
+        if first is not None and second is not None and len(rows) and comparable(first, second):
             agree[i, j] = rows[agreeing(first, second, (pixels[i][rows[:, 0]], pixels[j][rows[:, 1]]), seed)]
         if progress:
             progress(done + 1, len(raw))
@@ -97,7 +95,7 @@ def agreement(
         if not (believed[i] and believed[j]):
             continue
         if (i, j) not in verified:
-            if len(rows) >= ENOUGH:
+            if len(rows) >= FEWEST_MATCHES:
                 added.append((i, j))
         elif not supported[i, j]:
             dropped.append((i, j))

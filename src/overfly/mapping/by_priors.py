@@ -20,7 +20,7 @@ from overfly.mapping.database import focal_px
 from overfly.mapping.overlays import Prior
 from overfly.mapping.placing import gps_sigmas
 from overfly.mapping.prior_matches import Features, Verified, first_matches, more_matches
-from overfly.mapping.relative import UNIT_PX
+from overfly.mapping.relative import unit_px
 
 FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
 """What a ray is taken to be worth, pixels, one adjustment after another: at first directions are wrong by a degree."""
@@ -88,9 +88,7 @@ def bundle_by_priors(
         pixels=np.zeros((0, 2)),
     )
     places, sigmas = told[known], gps_sigmas([frames[i] for i in known]) * LOOSE
-    rows = first_matches(
-        start, own, rows, [priors[i] for i in known] if len(priors) else [None] * len(known), seed, progress
-    )
+    rows = first_matches(start, own, rows, [priors[i] for i in known] if priors else [], seed, progress)
     if not rows:
         return None
     ups = start.rotations[:, :, 2]
@@ -124,7 +122,7 @@ def _fitted(
     image, point, at = _tracks([pixels for pixels, _ in features], rows)
     points = np.zeros((point.max(initial=-1) + 1, 3))
     bundle = _triangulated(replace(start, points=points, image=image, point=point, pixels=at))
-    unit = max(1.0, max(max(frames[i].width, frames[i].height) for i in start.frames) / UNIT_PX)
+    unit = max(unit_px(frames[i].width, frames[i].height) for i in start.frames)
     for sigma in (unit * sigma for sigma in sigmas_px):
         if len(bundle.points) < FEWEST_RAYS:
             return bundle

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.geometry import Array
-from overfly.mapping.agreement import ENOUGH
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.guided import guided_matches
+from overfly.mapping.model import FEWEST_MATCHES
 from overfly.mapping.overlays import Prior
-from overfly.mapping.relative import UNIT_PX, agreeing
+from overfly.mapping.relative import agreeing, unit_px
 
 REACH_PX, FAR_REACH_PX = 3.0, 40.0
 """Off its epipolar line a key point is looked for so far, and so far if one of the images has no match yet."""
@@ -69,7 +69,7 @@ def first_matches(
             progress(done, len(near))
         first, second = priors[i], priors[j]
         had = rows.get((i, j), np.zeros((0, 2), np.uint32))
-        if first is None or second is None or len(had) >= ENOUGH:
+        if first is None or second is None or len(had) >= FEWEST_MATCHES:
             continue
         new = _guided(start, (i, j), features, heights, FIRST_REACH_PX * max(unit[i], unit[j]))
         both = np.unique(np.concatenate([had, new]), axis=0)
@@ -91,9 +91,8 @@ def more_matches(
     for done, (i, j) in enumerate(near):
         reach = (REACH_PX if seen[i] and seen[j] else FAR_REACH_PX) * max(unit[i], unit[j])
         new = _guided(bundle, (i, j), features, heights, reach)
-        if len(new) and len(
-            _guided(bundle, (i, j), _displaced(features, j, bundle), heights, reach)
-        ) <= BY_CHANCE * len(new):
+        chance = len(_guided(bundle, (i, j), _displaced(features, j, bundle), heights, reach)) if len(new) else 0
+        if len(new) and chance <= BY_CHANCE * len(new):
             found[i, j] = np.unique(np.concatenate([rows.get((i, j), new[:0]), new]), axis=0)
         if progress:
             progress(done + 1, len(near))
@@ -101,8 +100,8 @@ def more_matches(
 
 
 def _unit(bundle: Bundle) -> Array:
-    """Pixels [n] of each image in those of :data:`UNIT_PX`."""
-    return np.maximum(1.0, 2 * bundle.lenses[bundle.lens_of, 1:3].max(1) / UNIT_PX)
+    """Pixels [n] of each image in one of the lengths above."""
+    return np.array([unit_px(*(2 * lens[1:3])) for lens in bundle.lenses])[bundle.lens_of]
 
 
 def _near(bundle: Bundle, ground: float) -> list[tuple[int, int]]:

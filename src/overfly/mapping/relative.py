@@ -46,6 +46,11 @@ FEWEST, BY_CHANCE = 6, 1e-2
 """Matches that must agree, and in what share of the pairs with wrong matches alone as many may."""
 
 
+def unit_px(width: float, height: float) -> float:
+    """Pixels of an image in one of the lengths that are given for images of :data:`UNIT_PX`."""
+    return max(1.0, max(width, height) / UNIT_PX)
+
+
 class Pair(NamedTuple):
     """Priors and rays of matches of two frames, in world axes.
 
@@ -73,7 +78,7 @@ class Pair(NamedTuple):
         return self._replace(rays=(self.rays[0][chosen], self.rays[1][chosen]))
 
 
-def judged(first: Prior, second: Prior) -> bool:
+def comparable(first: Prior, second: Prior) -> bool:
     """Whether the priors tell the direction of the base: those of copies and of a drone that hovers do not."""
     base = second.world_from_camera[:3, 3] - first.world_from_camera[:3, 3]
     return float(np.linalg.norm(base)) >= SHORTEST * np.sqrt(2) * GPS_M[0]
@@ -85,14 +90,14 @@ def agreeing(
     """Which matches [m] agree with one pose near the priors; none where as many would by chance.
 
     Args:
-        first, second: of the frames; pairs that are not :func:`judged` agree on nothing.
+        first, second: of the frames; pairs that are not :func:`comparable` agree on nothing.
         pixels: of the matches, [m, 2] in each image.
         seed: of the draws.
         reach: pixels of images of :data:`UNIT_PX` off the epipolar lines of the priors within which matches were
             looked for.
     """
     agree = np.zeros(len(pixels[0]), bool)
-    if not judged(first, second):
+    if not comparable(first, second):
         return agree
     pair = _pair(first, second, pixels)
     prior = np.zeros((1, 5))
@@ -149,7 +154,7 @@ def _pair(first: Prior, second: Prior, pixels: tuple[NDArray, NDArray]) -> Pair:
     for prior, at in zip(priors, pixels, strict=True):
         local = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(prior.camera.matrix()).T
         rays.append(local @ prior.world_from_camera[:3, :3].T)
-    units = [max(1.0, max(prior.camera.width, prior.camera.height) / UNIT_PX) for prior in priors]
+    units = [unit_px(prior.camera.width, prior.camera.height) for prior in priors]
     base = second.world_from_camera[:3, 3] - first.world_from_camera[:3, 3]
     sides = _across(base)
     return Pair(
@@ -182,12 +187,14 @@ def _spread(base: Array, sides: Array) -> Array:
     return np.concatenate([turns, np.hypot(place, turned)])
 
 
-def _turned(moved: Array, rays: Array) -> Array:
-    """Rays [m, 3] or [h, m, 3] turned by rotation vectors moved[:, :3]: [h, m, 3]."""
+def _moved(pair: Pair, moved: Array, drawn: NDArray | None = None) -> tuple[Array, Array, Array]:
+    """Both rays [h, m, 3] of all matches or of those drawn [h, m], and bases [h, 1, 3], for hypotheses moved [h, 5]."""
     from scipy.spatial.transform import Rotation
 
-    matrices = Rotation.from_rotvec(moved[:, :3]).as_matrix()
-    return np.asarray(np.einsum("hij,mj->hmi" if rays.ndim == 2 else "hij,hmj->hmi", matrices, rays))
+    a, b = (rays if drawn is None else rays[drawn] for rays in pair.rays)
+    turns = Rotation.from_rotvec(moved[:, :3]).as_matrix()
+    turned = np.asarray(np.einsum("hij,mj->hmi" if b.ndim == 2 else "hij,hmj->hmi", turns, b))
+    return np.broadcast_to(a, turned.shape), turned, (pair.base + moved[:, 3:] @ pair.sides)[:, None]
 
 
 def _residuals(pair: Pair, moved: Array, drawn: NDArray | None = None) -> tuple[Array, Array]:
@@ -195,10 +202,7 @@ def _residuals(pair: Pair, moved: Array, drawn: NDArray | None = None) -> tuple[
 
     Sampson's distance (Hartley & Zisserman 2004, eq. 11.9), of all matches or of those drawn [h, m].
     """
-    a, b = (rays if drawn is None else rays[drawn] for rays in pair.rays)
-    a = np.broadcast_to(a, (len(moved), *a.shape[-2:]))
-    b = _turned(moved, b)
-    base = (pair.base + moved[:, 3:] @ pair.sides)[:, None]
+    a, b, base = _moved(pair, moved, drawn)
     plane, other = np.cross(base, a), np.cross(b, base)
     error = (b * plane).sum(-1)
     grow = np.stack([np.linalg.norm((plane @ pair.rotations[1])[..., :2], axis=-1) / pair.focals[1],
@@ -210,9 +214,7 @@ def _residuals(pair: Pair, moved: Array, drawn: NDArray | None = None) -> tuple[
 
 def _on_ground(pair: Pair, moved: Array) -> NDArray[np.bool_]:
     """Whether matches [h, m] meet before both cameras, at depths where ground can be, unsure as the base is long."""
-    a = np.broadcast_to(pair.rays[0], (len(moved), *pair.rays[0].shape))
-    b = _turned(moved, pair.rays[1])
-    base = (pair.base + moved[:, 3:] @ pair.sides)[:, None]
+    a, b, base = _moved(pair, moved)
     # The depths s, t at which s a and base + t b are nearest.
     aa, bb, ab = (a * a).sum(-1), (b * b).sum(-1), (a * b).sum(-1)
     da, db = (a * base).sum(-1), (b * base).sum(-1)

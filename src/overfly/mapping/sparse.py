@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,21 @@ WORSE = 2.0
 
 GOOD_PX = 0.5
 """Errors are compared with so much at least: those of a few wrong points may be zero."""
+
+
+class _Start(NamedTuple):
+    """Models, whether they agree with GPS as far as it is known, and whether they are good enough."""
+
+    parts: list[Bundle]
+    agrees: bool
+    good: bool
+
+    def better_than(self, other: _Start) -> bool:
+        if not self.parts or not other.parts:
+            return bool(self.parts)
+        if self.agrees != other.agrees:
+            return self.agrees
+        return _more_placed(self.parts[0], other.parts[0])
 
 
 def sparse_parts(
@@ -79,65 +95,68 @@ def sparse_parts(
         free = found(folder, calibrate=True)
         return free if not held or (free and len(free[0]) > len(held[0])) else held
 
-    def judged(parts: list[Bundle], matches: Mapping[tuple[int, int], int]) -> tuple[bool, bool]:
-        """Whether parts agree with GPS, as far as it is known, and whether they are good enough."""
+    stand = [] if told is None else priors(flight.frames, told)
+
+    def judged(parts: list[Bundle], found: Agreement | None) -> _Start:
         if not parts or told is None:
-            return bool(parts), bool(parts) and len(parts[0]) >= ENOUGH * len(names)
-        kept = upheld(parts[0], matches) / len(parts[0])
-        agree = kept >= MOST and agrees_with_gps(parts[0], told, flight.frames)
-        return agree, agree and kept >= 1 - CONTRADICTED and len(parts[0]) >= ENOUGH * len(names)
+            return _Start(parts, bool(parts), bool(parts) and len(parts[0]) >= ENOUGH * len(names))
+        kept = upheld(parts[0], found.sure() if found else {}) / len(parts[0])
+        agrees = kept >= MOST and agrees_with_gps(parts[0], told, flight.frames)
+        good = agrees and kept >= 1 - CONTRADICTED and len(parts[0]) >= ENOUGH * len(names)
+        return _Start(parts, agrees, good)
 
-    def better(new: list[Bundle], old: list[Bundle], matches: Mapping[tuple[int, int], int]) -> bool:
-        now, was = judged(new, matches)[0], judged(old, matches)[0]
-        return bool(new) and (not old or now > was or (now == was and _more_placed(new[0], old[0])))
-
-    def started(database: Path, folder: Path) -> tuple[list[Bundle], Agreement | None]:
+    def started(database: Path, folder: Path) -> tuple[_Start, Agreement | None]:
         """Models of matches that agree with the priors, and what agrees."""
-        if told is None or not any(stand := priors(flight.frames, told)):
-            return built_up(database, folder), None
+        if not any(stand):
+            return judged(built_up(database, folder), None), None
         with bar("agreement", "pairs") as update:
             found = agreement(database, names, stand, seed, update)
         log.info("pairs against GPS and gimbals: %s; pairs by them: %s", found.dropped, found.added)
 
-        def agreeing() -> list[Bundle]:
+        def agreeing() -> _Start:
             copy = rewritten(database, names, found, seed)
             try:
-                return built_up(copy, folder / "agreeing")
+                return judged(built_up(copy, folder / "agreeing"), found)
             finally:
                 copy.unlink()
 
-        best = agreeing() if found.dropped else built_up(database, folder)
-        if not judged(best, found.sure())[1] and (found.dropped or found.added):
-            other = built_up(database, folder) if found.dropped else agreeing()
-            best = other if better(other, best, found.sure()) else best
+        def as_it_is() -> _Start:
+            return judged(built_up(database, folder), found)
+
+        ways = [agreeing, as_it_is] if found.dropped else [as_it_is, *([agreeing] if found.added else [])]
+        best = ways[0]()
+        for way in ways[1:]:
+            if not best.good and (other := way()).better_than(best):
+                best = other
         return best, found
 
     best, found = started(database, workdir)
-    agrees, good = judged(best, found.sure() if found else {})
-    if not good and more is not None:
+    if not best.good and more is not None:
         database = more()
         richer, found = started(database, workdir / "more")
-        if better(richer, best, sure := found.sure() if found else {}):
-            best, (agrees, good) = richer, judged(richer, sure)
+        if richer.better_than(best):
+            best = richer
             warnings.append(
                 "SIFT found too few matches to place all images in agreement with GPS, and the network's were added: "
                 "fly with more overlap, and look at the picture of the block."
             )
-    if good or told is None:
-        return best
+    if best.good or told is None:
+        return best.parts
     features, lens_ids = read_points(database, names)
     matches = found.verified if found else read_verified(database, names)
-    stand = [p if found and found.believed[i] else None for i, p in enumerate(priors(flight.frames, told))]
+    believed = [p if found and found.believed[i] else None for i, p in enumerate(stand)]
     with bar("guided matches", "pairs") as update:
         prior = bundle_by_priors(
-            flight.frames, told, features, matches, lens_ids, priors=stand, seed=seed, progress=update
+            flight.frames, told, features, matches, lens_ids, priors=believed, seed=seed, progress=update
         )
     parts = [] if prior is None else components(prior)
     trusted = found is not None and found.believed.mean() >= TRUSTED
-    if not parts or (best and not _better(parts[0], best[0], agrees, trusted)):
-        return best
-    left = len(names) - (len(best[0]) if best else 0)
-    failed = "contradicted GPS or most matches" if best and not agrees else f"left out {left} of {len(names)} images"
+    if not parts or (best.parts and not _better(parts[0], best.parts[0], best.agrees, trusted)):
+        return best.parts
+    left = len(names) - (len(best.parts[0]) if best.parts else 0)
+    failed = f"left out {left} of {len(names)} images"
+    if best.parts and not best.agrees:
+        failed = "contradicted GPS or most matches"
     tried = "" if more is None else ", also with the network's,"
     warnings.append(
         f"Matches were so few{tried} that sparse mapping {failed}: the cameras were started where GPS and gimbals say "
