@@ -115,6 +115,38 @@ def test_only_what_another_frame_has_surely_measured_makes_a_wall(
     assert not (apart >= WALL).any()
 
 
+@pytest.mark.parametrize(("before", "foot"), [(2.0, 0.0), (np.nan, 0.0), (8.5, np.nan)])
+def test_what_is_low_before_a_wall_does_not_hide_its_foot(before: float, foot: float) -> None:
+    z = np.array([[10, np.nan, before, before, 0, 0] + [np.nan] * walls.GAP])
+    ground = z == 0
+    edge = np.zeros(1, np.intp)
+    found = walls._foot(z, ground, edge, edge, (0, 1), 2.5)
+    np.testing.assert_equal(found, [foot])
+
+
+def test_a_wall_takes_the_place_of_a_network_s_word(tmp_path: Path) -> None:
+    shape = CAMERA.height, CAMERA.width
+    depth = house()
+    wall = np.isnan(depth)
+    data = {
+        "depth": np.where(wall, np.float32(71), depth), "sigma": np.full(shape, 0.1, np.float32),
+        "support": np.where(wall, 0, 2).astype(np.uint8), "score": np.ones(shape, np.float32),
+        "guessed": wall, "second": wall, "once": wall, "sure": np.full(shape, 0.8, np.float32),
+    }  # fmt: skip
+    frame = Frame("a", tmp_path / "a.png", CAMERA.width, CAMERA.height, camera=CAMERA)
+    Image.fromarray(np.zeros((*shape, 3), np.uint8)).save(frame.path)
+    own = DepthMap("a", CAMERA, DOWN, [], tmp_path / "a")
+    plain, *_ = frame_points(own, data, [], frame, single=True, walls=False)
+    cloud, apart, given, _ = frame_points(own, data, [], frame, single=True, walls=True)
+    assert cloud.predicted is not None
+    assert plain.predicted is not None
+    words, on_wall = cloud.points[cloud.predicted & (apart < WALL)], cloud.points[apart >= WALL]
+    assert len(on_wall) > 1000
+    assert plain.predicted.sum() == wall.sum()
+    assert len(words) < 0.1 * wall.sum()
+    assert given[wall].all()  # later frames need not say it either
+
+
 def test_a_deck_under_which_the_ground_was_matched_has_no_walls() -> None:
     depth = house()
     depth[np.isnan(depth)] = 75

@@ -15,7 +15,7 @@ from overfly.mapping.depth_map import DepthMap, Opinion
 from overfly.mapping.point_sigma import point_sigmas, roughness
 from overfly.mapping.subpixel import Map
 from overfly.mapping.thinning import WALL
-from overfly.mapping.walls import CONFIDENCE, SIGMA, looked_up, measured_points, wall_points
+from overfly.mapping.walls import CONFIDENCE, SIGMA, Walls, looked_up, measured_points, wall_points
 
 WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
@@ -165,6 +165,13 @@ def frame_points(
     # What is doubted counts as given: else Brighton gets twice the false points, from frames that agree by chance, too.
     # The price: a later frame that is surer of the place is not asked.
     fresh = known & ~seen.taken & ~doubted
+    walled = None
+    if walls:
+        # Where the frame shows a wall between roof and ground, no word of the network alone stands.
+        left = np.where(known & ~alone, seen.depth, np.float32(np.nan))
+        left = np.where(shown, left, np.float32(np.inf))
+        walled = wall_points(left, ~second, own.camera, own.world_from_camera, around)
+        fresh[walled.rows, walled.columns] = False
     merged = seen.depth[fresh]
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
@@ -183,10 +190,9 @@ def frame_points(
         predicted=alone[fresh],
     )
     apart = apart[fresh]
-    if walls:
-        left = np.where(known, seen.depth, np.float32(np.nan))
-        left = np.where(shown, left, np.float32(np.inf))
-        cloud, apart = _with_walls(cloud, apart, left, second, own, image, around)
+    if walled is not None:
+        cloud = concatenate([cloud, _wall_cloud(walled, own, image)])
+        apart = np.concatenate([apart, np.full(len(walled.points), WALL + walled.voxels, np.uint8)])
     measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
     gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
     return cloud, apart, known, gsd
@@ -204,28 +210,18 @@ def _noted(own: DepthMap, partners: Iterable[Partner], around: list[NDArray]) ->
         yield partner, data, given
 
 
-def _with_walls(
-    cloud: Cloud,
-    apart: NDArray[np.uint8],
-    depth: Map,
-    second: NDArray[np.bool_],
-    own: DepthMap,
-    image: NDArray,
-    around: list[NDArray],
-) -> tuple[Cloud, NDArray[np.uint8]]:
-    """The points of a frame, and what it shows of walls that nobody has matched."""
-    points, rows, columns, voxels = wall_points(depth, ~second, own.camera, own.world_from_camera, around)
-    n = len(points)
-    gsd = np.linalg.norm(points - own.world_from_camera[:3, 3], axis=1) / own.camera.fx
-    walls = Cloud(
-        points,
-        image[rows, columns],
+def _wall_cloud(walled: Walls, own: DepthMap, image: NDArray) -> Cloud:
+    """What a frame shows of walls that nobody has matched."""
+    n = len(walled.points)
+    gsd = np.linalg.norm(walled.points - own.world_from_camera[:3, 3], axis=1) / own.camera.fx
+    return Cloud(
+        walled.points,
+        image[walled.rows, walled.columns],
         confidence=np.full(n, CONFIDENCE, np.float32),
         sigma_m=(SIGMA * gsd).astype(np.float32),
         views=np.ones(n, np.uint8),
         predicted=np.ones(n, bool),
     )
-    return concatenate([cloud, walls]), np.concatenate([apart, np.full(n, WALL + voxels, np.uint8)])
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

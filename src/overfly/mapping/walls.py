@@ -7,6 +7,7 @@ and below it is measured, though, and between the two nothing else can be.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +31,11 @@ GAP = 20
 AROUND, FIRM, ALIKE = 3, 10, 1.5
 """A cell stands firm where so many of those up to so many cells away are measured and differ by fewer cells."""
 
-FLAT_M, FLAT_PIXELS, PLANE = 0.12, 2, 2
+FLAT_M, FLAT_PIXELS, PLANE = 0.12, 2.5, 2
 """Root mean square, metres and ground pixels, whichever is more, by which the cells up to so many away on a roof may
 miss a plane."""
 
-LEVEL, FAR_PLANE, ROOF_M2 = 0.5, 4, 20.0
+LEVEL, FAR_PLANE, ROOF_M2 = 0.5, 4, 12.0
 """Share of a roof's cells that lie in a plane with those up to so many away, and least plan of a roof. Of the crowns of
 large trees, which are as flat as roofs along two cells (Tampa), hardly one has so many."""
 
@@ -64,9 +65,24 @@ CONFIDENCE, SIGMA = 0.95, 2.5
 in ground pixels, on rendered flights at 50 % over blocks, campus and suburb."""
 
 
+class Walls(NamedTuple):
+    """What a frame shows of walls.
+
+    Attributes:
+        points: [N, 3], a ground pixel apart.
+        rows, columns: [N] of the pixels that show them.
+        voxels: how many ground pixels wide the cubes are in which other points make them needless.
+    """
+
+    points: Array
+    rows: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    voxels: int
+
+
 def wall_points(
     depth: Map, measured: NDArray[np.bool_], camera: Camera, world_from_camera: Array, around: Sequence[Array] = ()
-) -> tuple[Array, NDArray[np.intp], NDArray[np.intp], int]:
+) -> Walls:
     """Points on the walls that a frame shows in its blank pixels.
 
     Args:
@@ -76,12 +92,8 @@ def wall_points(
         world_from_camera: [4, 4], z up.
         around: points [M, 3] inside the image that other frames have measured: what hides the ground here need not hide
             it there.
-
-    Returns:
-        Points [N, 3] a ground pixel apart, the rows and columns [N] that show them, and how many ground pixels wide the
-        cubes are in which other points make them needless.
     """
-    nothing = np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp), 1
+    nothing = Walls(np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp), 1)
     blank = np.isnan(depth)
     points = measured_points(np.where(measured, depth, np.nan), camera, world_from_camera, PIXELS)
     if not len(points):
@@ -107,7 +119,7 @@ def wall_points(
     shown = shown[away[shown] < nearest[flat] + TALLEST * gsd]
     found[:, :2] -= INWARD * gsd * outward  # after it was looked for where its edge was seen
     voxels = next(size for size in DIVISORS if size >= cell / gsd - 1e-6 or size == DIVISORS[-1])
-    return found[shown], row[shown], column[shown], voxels
+    return Walls(found[shown], row[shown], column[shown], voxels)
 
 
 def _hidden(
@@ -260,15 +272,19 @@ def _foot(
     way: tuple[int, int],
     step: float,
 ) -> Array:
-    """Height [N] of the ``ground`` before each edge, NaN where there is none, or something else before it."""
+    """Height [N] of the ``ground`` before each edge, NaN where there is none, or something as high before it.
+
+    Low things before the wall (trees, cars, sheds) do not count: what they hide of it is not blank.
+    """
     top, foot = z[row, column], np.full(len(row), np.nan)
     open_ = np.ones(len(row), bool)
     for k in range(1, GAP + 1):
         at = row + k * way[0], column + k * way[1]
         there = z[at]
         with np.errstate(invalid="ignore"):
-            low = open_ & (top - there > step) & ground[at]
+            low = top - there > step
+            foot_here = open_ & low & ground[at]
             # The first cell may hold points of both, roof and ground.
-            open_ &= ~low & ~(np.isfinite(there) & ((k > 1) | (top - there < 0.25 * step)))
-        foot[low] = there[low]
+            open_ &= ~foot_here & ~(np.isfinite(there) & ~low & ((k > 1) | (top - there < 0.25 * step)))
+        foot[foot_here] = there[foot_here]
     return foot
