@@ -100,7 +100,7 @@ def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_neede
         (Part("few", 18), Part("many", 12), "", "prior", "many.db", 1),  # still too few: the priors have all matches
         (Part("few", 20), None, "", "few", None, 0),  # nothing more is asked for
         (Part("few", 18), Part("many", 20), "many", "prior", "many.db", 1),  # more images, but against GPS
-        (Part("few", 20), Part("many", 18), "few", "prior", "many.db", 2),
+        (Part("few", 20), Part("many", 18), "few", "prior", "many.db", 1),
         (Part("few", 18), Part("many", 20, 3.0), "", "prior", "many.db", 1),  # more images, far worse
     ],
 )

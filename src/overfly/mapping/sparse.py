@@ -130,17 +130,19 @@ def sparse_parts(
                 best = other
         return best, found
 
+    remark: list[str] = []
     best, found = started(database, workdir)
     if not best.good and more is not None:
         database = more()
         richer, found = started(database, workdir / "more")
         if richer.better_than(best):
             best = richer
-            warnings.append(
+            remark = [
                 "SIFT found too few matches to place all images in agreement with GPS, and the network's were added: "
                 "fly with more overlap, and look at the picture of the block."
-            )
+            ]
     if best.good or told is None:
+        warnings += remark
         return best.parts
     features, lens_ids = read_points(database, names)
     matches = found.verified if found else read_verified(database, names)
@@ -152,6 +154,7 @@ def sparse_parts(
     parts = [] if prior is None else components(prior)
     trusted = found is not None and found.believed.mean() >= TRUSTED
     if not parts or (best.parts and not _better(parts[0], best.parts[0], best.agrees, trusted)):
+        warnings += remark
         return best.parts
     left = len(names) - (len(best.parts[0]) if best.parts else 0)
     failed = f"left out {left} of {len(names)} images"
