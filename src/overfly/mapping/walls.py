@@ -37,7 +37,8 @@ miss a plane."""
 
 LEVEL, FAR_PLANE, ROOF_M2 = 0.5, 4, 12.0
 """Share of a roof's cells that lie in a plane with those up to so many away, and least plan of a roof. Of the crowns of
-large trees, which are as flat as roofs along two cells (Tampa), hardly one has so many."""
+large trees, which are as flat as roofs along two cells (Tampa), few have so many; of 20 m² hardly one has, but gables
+of houses are no larger (F-score at 1 m 0.003 less)."""
 
 GROUND_M2 = 60.0
 """Least plan of the ground before a wall: else a pit of wrong matches would get walls, too."""
