@@ -12,7 +12,7 @@ from PIL import Image
 
 from overfly.cloud import Cloud
 from overfly.flights import Frame
-from overfly.geometry import Array, Camera, pixel_grid, pose, rays, rotation_from_gimbal
+from overfly.geometry import Array, Camera, pixel_grid, pose, rays, rotation_from_gimbal, unproject
 from overfly.mapping import walls
 from overfly.mapping.depth_map import DepthMap
 from overfly.mapping.frame_points import frame_points
@@ -115,21 +115,62 @@ def test_only_what_another_frame_has_surely_measured_makes_a_wall(
     assert not (apart >= WALL).any()
 
 
-@pytest.mark.parametrize(("before", "foot"), [(2.0, 0.0), (np.nan, 0.0), (8.5, np.nan)])
-def test_what_is_low_before_a_wall_does_not_hide_its_foot(before: float, foot: float) -> None:
+@pytest.mark.parametrize(
+    ("before", "flat", "foot"), [(2.0, False, 0.0), (2.0, True, np.nan), (np.nan, False, 0.0), (8.5, False, np.nan)]
+)
+def test_of_what_stands_before_a_wall_only_what_is_low_and_rough_is_passed_over(
+    before: float, flat: bool, foot: float
+) -> None:
     z = np.array([[10, np.nan, before, before, 0, 0] + [np.nan] * walls.GAP])
-    ground = z == 0
     edge = np.zeros(1, np.intp)
-    found = walls._foot(z, ground, edge, edge, (0, 1), 2.5)
+    found = walls._foot(z, z == 0, (z == before) & flat, edge, edge, (0, 1), 2.5)
     np.testing.assert_equal(found, [foot])
 
 
-def test_a_wall_takes_the_place_of_a_network_s_word(tmp_path: Path) -> None:
-    shape = CAMERA.height, CAMERA.width
+def test_a_wall_does_not_run_through_an_annex_that_another_frame_has_measured() -> None:
     depth = house()
+    x, y = np.mgrid[WEST - 4 : WEST : 0.2, -3:3:0.2].reshape(2, -1)
+    annex = np.stack([x, y, np.full(len(x), 3.0)], axis=1)
+    beside = (np.abs(unproject(pixel_grid(400, 300), np.full_like(depth, 72), CAMERA, DOWN)[..., :2]) < [WEST, 3]).all(
+        2
+    )
+    depth[beside & (np.arange(400) > 220)] = np.nan  # where this frame shows it, it has matched nothing
+    points, *_ = wall_points(depth, np.isfinite(depth), CAMERA, DOWN, [annex])
+    assert len(points) > 500
+    assert not ((np.abs(points[:, 1]) < 2) & (points[:, 2] < 2.5)).any()
+
+
+def test_a_wall_behind_what_another_frame_has_measured_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    depth = house()
+    open_ = wall_points(depth, np.isfinite(depth), CAMERA, DOWN).points
+    screen = DOWN[:3, 3] + 0.4 * (open_ - DOWN[:3, 3])  # 45 m up, before all of the wall
+    depth[:, 200:235] = np.nan
+    assert len(wall_points(depth, np.isfinite(depth), CAMERA, DOWN, [screen]).points) < 0.3 * len(open_)
+    monkeypatch.setattr(walls, "_hidden", lambda points, row, *_: np.zeros(len(row), bool))
+    assert len(wall_points(depth, np.isfinite(depth), CAMERA, DOWN, [screen]).points) > 0.5 * len(open_)
+
+
+@pytest.mark.parametrize(("side", "stands"), [(3.0, False), (5.5, True)])
+def test_least_plan_of_a_roof(side: float, stands: bool) -> None:
+    grid = Grid(0.0, 24.0, 0.4, 60, 60)
+    x, y = np.moveaxis(grid.centres() - 12, -1, 0)
+    heights = np.where((np.abs(x) < side / 2) & (np.abs(y) < side / 2), 7.0, 0.0)
+    seen = Surface(grid, heights, None, np.ones((60, 60), np.int64))
+    assert bool(len(walls._curtains(seen, 0.1)[0])) == stands
+
+
+@pytest.mark.parametrize("height", [10.0, 20.0, 30.0])
+@pytest.mark.parametrize(("word", "stays"), [(1.0, False), (-1.0, True)])
+def test_a_wall_takes_the_place_of_a_network_s_word_but_for_what_stands_before_it(
+    height: float, word: float, stays: bool, tmp_path: Path
+) -> None:
+    """The word lies on the ground behind the wall, or on something that stands clearly before it."""
+    shape = CAMERA.height, CAMERA.width
+    depth = house(height)
     wall = np.isnan(depth)
+    said = np.where(word > 0, 75, 75 - height - 5)
     data = {
-        "depth": np.where(wall, np.float32(71), depth), "sigma": np.full(shape, 0.1, np.float32),
+        "depth": np.where(wall, said, depth).astype(np.float32), "sigma": np.full(shape, 0.1, np.float32),
         "support": np.where(wall, 0, 2).astype(np.uint8), "score": np.ones(shape, np.float32),
         "guessed": wall, "second": wall, "once": wall, "sure": np.full(shape, 0.8, np.float32),
     }  # fmt: skip
@@ -141,10 +182,14 @@ def test_a_wall_takes_the_place_of_a_network_s_word(tmp_path: Path) -> None:
     assert cloud.predicted is not None
     assert plain.predicted is not None
     words, on_wall = cloud.points[cloud.predicted & (apart < WALL)], cloud.points[apart >= WALL]
-    assert len(on_wall) > 1000
     assert plain.predicted.sum() == wall.sum()
-    assert len(words) < 0.1 * wall.sum()
     assert given[wall].all()  # later frames need not say it either
+    if stays:
+        assert len(words) == wall.sum()
+        assert not len(on_wall)
+    else:
+        assert len(words) < 0.1 * wall.sum()
+        assert len(on_wall) > 1000
 
 
 def test_a_deck_under_which_the_ground_was_matched_has_no_walls() -> None:

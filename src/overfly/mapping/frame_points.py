@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from overfly.cloud import Cloud, concatenate
 from overfly.flights import Frame
 from overfly.geometry import unproject
-from overfly.mapping.compared import Partner, compared
+from overfly.mapping.compared import GATE, Partner, compared
 from overfly.mapping.depth_map import DepthMap, Opinion
 from overfly.mapping.point_sigma import point_sigmas, roughness
 from overfly.mapping.subpixel import Map
 from overfly.mapping.thinning import WALL
-from overfly.mapping.walls import CONFIDENCE, SIGMA, Walls, looked_up, measured_points, wall_points
+from overfly.mapping.wall_cloud import instead_of_words, wall_cloud
+from overfly.mapping.walls import looked_up, measured_points, wall_points
 
 WORST_SCORE = {True: 0.2, False: 0.3}
 """Smallest correlation of a point that several pairs confirm, and of one that only one pair has seen."""
@@ -131,11 +132,13 @@ def frame_points(
             one, the pixels [H, W] that it has given.
         frame: it was made from, for the colours.
         single: keep points that only one pair has seen.
-        walls: add what the frame shows of walls that nobody has matched; the frame of reference is in metres.
+        walls: add what the frame shows of walls that nobody has matched, also in place of what the network alone says
+            there; the frame of reference is in metres.
 
     Returns:
         The points; how far apart [N] from matched points they stand (:func:`overfly.mapping.thinning.thinned_tile`), 0
-        for what pairs have matched; which pixels are given now [H, W]; and metres per pixel.
+        for what pairs have matched; which pixels [H, W] later frames need not give: given now, doubted, or
+        replaced by a wall; and metres per pixel.
     """
     depth: Map = data["depth"]
     guessed = data.get("guessed", np.zeros(depth.shape, bool))
@@ -165,13 +168,16 @@ def frame_points(
     # What is doubted counts as given: else Brighton gets twice the false points, from frames that agree by chance, too.
     # The price: a later frame that is surer of the place is not asked.
     fresh = known & ~seen.taken & ~doubted
-    walled = None
+    on_walls = None
     if walls:
-        # Where the frame shows a wall between roof and ground, no word of the network alone stands.
-        left = np.where(known & ~alone, seen.depth, np.float32(np.nan))
+        # Blank is also where a word was doubted, or is the network's alone: at walls it is wrong nine times in ten.
+        left = np.where(known & ~alone & ~doubted, seen.depth, np.float32(np.nan))
         left = np.where(shown, left, np.float32(np.inf))
-        walled = wall_points(left, ~second, own.camera, own.world_from_camera, around)
-        fresh[walled.rows, walled.columns] = False
+        on_walls = wall_points(left, ~second, own.camera, own.world_from_camera, around)
+        on_walls, words = instead_of_words(
+            on_walls, own, np.where(alone, seen.depth + GATE * seen.sigma, np.float32(np.nan))
+        )
+        fresh &= ~words
     merged = seen.depth[fresh]
     rows, columns = np.nonzero(fresh)
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=1)
@@ -190,9 +196,9 @@ def frame_points(
         predicted=alone[fresh],
     )
     apart = apart[fresh]
-    if walled is not None:
-        cloud = concatenate([cloud, _wall_cloud(walled, own, image)])
-        apart = np.concatenate([apart, np.full(len(walled.points), WALL + walled.voxels, np.uint8)])
+    if on_walls is not None:
+        cloud = concatenate([cloud, wall_cloud(on_walls, own, image)])
+        apart = np.concatenate([apart, np.full(len(on_walls.points), WALL + on_walls.voxels, np.uint8)])
     measured = merged[~second[fresh]] if (~second[fresh]).any() else merged
     gsd = float(np.median(measured)) / own.camera.fx if len(merged) else float("nan")
     return cloud, apart, known, gsd
@@ -208,20 +214,6 @@ def _noted(own: DepthMap, partners: Iterable[Partner], around: list[NDArray]) ->
         points = measured_points(depth, partner.camera, partner.world_from_camera)
         around.append(points[looked_up(points, own.camera, own.world_from_camera)[-1]])
         yield partner, data, given
-
-
-def _wall_cloud(walled: Walls, own: DepthMap, image: NDArray) -> Cloud:
-    """What a frame shows of walls that nobody has matched."""
-    n = len(walled.points)
-    gsd = np.linalg.norm(walled.points - own.world_from_camera[:3, 3], axis=1) / own.camera.fx
-    return Cloud(
-        walled.points,
-        image[walled.rows, walled.columns],
-        confidence=np.full(n, CONFIDENCE, np.float32),
-        sigma_m=(SIGMA * gsd).astype(np.float32),
-        views=np.ones(n, np.uint8),
-        predicted=np.ones(n, bool),
-    )
 
 
 def _shown(frame: Frame, own: DepthMap) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -175,7 +175,7 @@ class _Fusion:
         return self.workdir / f"given-{k:05d}.npz"
 
     def _given(self, k: int) -> NDArray[np.bool_]:
-        """The pixels [H, W] of a frame that later ones need not give: in the cloud already, or doubted."""
+        """The pixels [H, W] of a frame that later ones need not give (:func:`frame_points`)."""
         try:
             kept = load_arrays(self._mask(k))
         except Damaged:

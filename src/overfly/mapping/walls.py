@@ -1,7 +1,7 @@
 """Walls that one image shows and no pair matches: between a roof's measured edge and the measured ground before it.
 
 A wall is seen from one side, at a flat angle, by few images: pairs find a quarter to a half of it. What stands above
-and below it is measured, though, and between the two nothing else can be.
+and below it is measured, though, and what lies between the two is wall, or stands before it.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ FLAT_M, FLAT_PIXELS, PLANE = 0.12, 2.5, 2
 """Root mean square, metres and ground pixels, whichever is more, by which the cells up to so many away on a roof may
 miss a plane."""
 
-LEVEL, FAR_PLANE, ROOF_M2 = 0.5, 4, 12.0
-"""Share of a roof's cells that lie in a plane with those up to so many away, and least plan of a roof. Of the crowns of
-large trees, which are as flat as roofs along two cells (Tampa), few have so many; of 20 m² hardly one has, but gables
-of houses are no larger (F-score at 1 m 0.003 less)."""
+LEVEL, FAR_PLANE, ROOF_M2, ROOF_CELLS = 0.5, 4, 12.0, 24
+"""Share of a roof's cells that lie in a plane with those up to so many away, and least plan of a roof, in square metres
+and in cells. Of the crowns of large trees, which are as flat as roofs along two cells (Tampa), few have so many. With
+20 m², which hardly any crown has, small gables have no walls: F-scores at 1 m are 0.003 less."""
 
 GROUND_M2 = 60.0
 """Least plan of the ground before a wall: else a pit of wrong matches would get walls, too."""
@@ -66,7 +66,7 @@ CONFIDENCE, SIGMA = 0.95, 2.5
 in ground pixels, on rendered flights at 50 % over blocks, campus and suburb."""
 
 
-class Walls(NamedTuple):
+class WallPoints(NamedTuple):
     """What a frame shows of walls.
 
     Attributes:
@@ -83,18 +83,19 @@ class Walls(NamedTuple):
 
 def wall_points(
     depth: Map, measured: NDArray[np.bool_], camera: Camera, world_from_camera: Array, around: Sequence[Array] = ()
-) -> Walls:
+) -> WallPoints:
     """Points on the walls that a frame shows in its blank pixels.
 
     Args:
-        depth: [H, W] of the frame, metres, NaN where blank, infinite where the lens shows nothing.
+        depth: [H, W] of the frame, metres, NaN where nothing stands but perhaps a lone word of the network, infinite
+            where the lens shows nothing.
         measured: where pairs have matched it; elsewhere it is a guess, of which no roof and no ground is made.
         camera: undistorted, of the same size.
         world_from_camera: [4, 4], z up.
         around: points [M, 3] inside the image that other frames have measured: what hides the ground here need not hide
             it there.
     """
-    nothing = Walls(np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp), 1)
+    nothing = WallPoints(np.zeros((0, 3)), np.zeros(0, np.intp), np.zeros(0, np.intp), 1)
     blank = np.isnan(depth)
     points = measured_points(np.where(measured, depth, np.nan), camera, world_from_camera, PIXELS)
     if not len(points):
@@ -120,7 +121,7 @@ def wall_points(
     shown = shown[away[shown] < nearest[flat] + TALLEST * gsd]
     found[:, :2] -= INWARD * gsd * outward  # after it was looked for where its edge was seen
     voxels = next(size for size in DIVISORS if size >= cell / gsd - 1e-6 or size == DIVISORS[-1])
-    return Walls(found[shown], row[shown], column[shown], voxels)
+    return WallPoints(found[shown], row[shown], column[shown], voxels)
 
 
 def _hidden(
@@ -170,10 +171,10 @@ def _middle(depth: Map) -> float:
 def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
     """Points [N, 3] one ground pixel apart under the edges of roofs, and the way [N, 2] that each wall faces."""
     cell, step = seen.grid.cell, max(STEP_M, STEP_PIXELS * gsd)
-    roof, ground = _roofs(seen.heights, cell, max(FLAT_M, FLAT_PIXELS * gsd))
+    roof, ground, flat = _roofs(seen.heights, cell, max(FLAT_M, FLAT_PIXELS * gsd))
     margin = GAP + 1
     z = np.pad(seen.heights, margin, constant_values=np.nan)
-    roof, ground = np.pad(roof, margin), np.pad(ground, margin)
+    roof, ground, flat = (np.pad(part, margin) for part in (roof, ground, flat))
     parts = max(1, round(cell / gsd))  # points side by side on the border of a cell
     aside = ((np.arange(parts) + 0.5) / parts - 0.5) * cell
     points, ways = [np.zeros((0, 3))], [np.zeros((0, 2))]
@@ -181,7 +182,7 @@ def _curtains(seen: Surface, gsd: float) -> tuple[Array, Array]:
         with np.errstate(invalid="ignore"):
             edge = roof & ~(np.roll(z, (-down, -right), (0, 1)) > z - step)
         row, column = np.nonzero(edge)
-        foot = _foot(z, ground, row, column, (down, right), step)
+        foot = _foot(z, ground, flat, row, column, (down, right), step)
         held = np.isfinite(foot)
         row, column, foot = row[held], column[held], foot[held]
         count = ((z[row, column] - foot) / gsd).astype(np.intp)
@@ -208,19 +209,21 @@ def _firm(heights: Array, alike: float) -> NDArray[np.bool_]:
     return np.asarray(count >= FIRM)
 
 
-def _roofs(heights: Array, cell: float, most: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Firm cells [rows, columns] of pieces as large and as flat as a roof, and of those as large as ground."""
+def _roofs(heights: Array, cell: float, most: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Firm cells [rows, columns] of pieces as large and as flat as a roof, of those as large as ground, and all flat
+    ones."""
     firm = _firm(heights, ALIKE * cell)
     flat = np.zeros(heights.shape, bool)
     flat[firm] = _flat(heights, np.argwhere(firm), cell, most, PLANE)
     piece, count = _pieces(heights, flat, ALIKE * cell)
     size = np.bincount(piece.ravel(), weights=flat.ravel(), minlength=count) * cell**2
-    asked = flat & (size[piece] >= ROOF_M2)
+    large = size >= max(ROOF_M2, ROOF_CELLS * cell**2)
+    asked = flat & large[piece]
     asked[1::2] = asked[:, 1::2] = False  # every second row and column tell as much
     level = _flat(heights, np.argwhere(asked), cell, most, FAR_PLANE)
     of_all = np.bincount(piece[asked], minlength=count)
     share = np.bincount(piece[asked], weights=level, minlength=count) / np.maximum(of_all, 1)
-    return flat & ((size >= ROOF_M2) & (share >= LEVEL))[piece], flat & (size >= GROUND_M2)[piece]
+    return flat & (large & (share >= LEVEL))[piece], flat & (size >= GROUND_M2)[piece], flat
 
 
 def _flat(heights: Array, asked: NDArray[np.intp], cell: float, most: float, reach: int) -> NDArray[np.bool_]:
@@ -268,6 +271,7 @@ def _pieces(heights: Array, flat: NDArray[np.bool_], alike: float) -> tuple[NDAr
 def _foot(
     z: Array,
     ground: NDArray[np.bool_],
+    flat: NDArray[np.bool_],
     row: NDArray[np.intp],
     column: NDArray[np.intp],
     way: tuple[int, int],
@@ -275,7 +279,8 @@ def _foot(
 ) -> Array:
     """Height [N] of the ``ground`` before each edge, NaN where there is none, or something as high before it.
 
-    Low things before the wall (trees, cars, sheds) do not count: what they hide of it is not blank.
+    Low things before the wall that are not ``flat`` (trees, bushes, cars) do not count: what they hide of it is not
+    blank, or is told hidden. Before flat ones no wall is told: it would end on the roof of an annex.
     """
     top, foot = z[row, column], np.full(len(row), np.nan)
     open_ = np.ones(len(row), bool)
@@ -286,6 +291,7 @@ def _foot(
             low = top - there > step
             foot_here = open_ & low & ground[at]
             # The first cell may hold points of both, roof and ground.
-            open_ &= ~foot_here & ~(np.isfinite(there) & ~low & ((k > 1) | (top - there < 0.25 * step)))
+            stops = np.isfinite(there) & (~low | flat[at]) & ((k > 1) | (top - there < 0.25 * step))
         foot[foot_here] = there[foot_here]
+        open_ &= ~foot_here & ~stops
     return foot
