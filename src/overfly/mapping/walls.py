@@ -31,7 +31,7 @@ GAP = 20
 AROUND, FIRM, ALIKE = 3, 10, 1.5
 """A cell stands firm where so many of those up to so many cells away are measured and differ by fewer cells."""
 
-FLAT_M, FLAT_PIXELS, PLANE = 0.12, 2.5, 2
+FLAT_M, FLAT_PIXELS, PLANE = 0.12, 2, 2
 """Root mean square, metres and ground pixels, whichever is more, by which the cells up to so many away on a roof may
 miss a plane."""
 
