@@ -22,7 +22,7 @@ from overfly.geometry import Array, pixel_grid, unproject
 from overfly.metrics.functional import THRESHOLDS_M, harmonic
 from overfly.scenes import STYLES, Scene, load_scene, make_scene
 
-CELLS = {"grid-30": ("grid", 30), "grid-50": ("grid", 50), "grid-80": ("grid", 80), "circular-50": ("circular", 50)}
+CELLS = {f"{path}-{overlap}": (path, overlap) for path in ("grid", "circular") for overlap in (30, 50, 80)}
 ORBITS_M, BEYOND_M = 4.0, {"grid": 1.2, "double_grid": 2.0, "random": 2.0, "circular": 2.0}
 """As multiples of the altitude: side of the square that two orbits cover, and how much wider than it the scene is."""
 

@@ -86,7 +86,7 @@ def dense(images: Path, cameras: dict[str, tuple[Camera, Array]], surface: Array
     names = sorted(cameras)
     lenses, poses = [cameras[n][0] for n in names], [cameras[n][1] for n in names]
     ranges = depth_ranges(lenses, poses, surface)
-    partners = choose_partners(lenses, poses, [r[1] for r in ranges], count=4, ratio=(0.04, 0.9))
+    partners = choose_partners(lenses, poses, ranges, count=4, ratio=(0.04, 0.9))
     pairs = sorted({(min(i, j), max(i, j)) for i, chosen in enumerate(partners) for j in chosen})
     clouds = []
     for pair in pairs:

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from overfly.geometry import Camera, look_at, pixel_grid, pose, rotation_from_gimbal, unproject
-from overfly.mapping.coarse import _confirmed, coarse_points
+from overfly.mapping.coarse import _confirmed, coarse_points, narrowed
 from overfly.mapping.depth_ranges import beside_others, depth_ranges
+from overfly.mapping.views import Views
 
 
 def test_an_oblique_frame_does_not_see_far_under_the_ground_before_it() -> None:
@@ -35,6 +36,29 @@ def test_a_first_look_at_oblique_images_finds_the_ground(camera: Camera, hill, t
     assert np.median(off) < 0.5
     assert (off < 3).mean() > 0.9
     np.testing.assert_array_equal(points, coarse_points(frames, seed=0))
+
+
+def test_what_pairs_show_narrows_the_heights_that_are_searched(camera: Camera, hill, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    around = [look_at([60 * np.sin(t), 60 * np.cos(t), 80], [0, 0, 0]) for t in np.radians(range(0, 360, 30))]
+    flight = Views(hill.frames(tmp_path, camera, around, known=True), 1600)
+    points = hill.surface(camera, around[0])[::20, ::20].reshape(-1, 3)
+    spans = depth_ranges(flight.full, flight.poses, points)
+    partners = [[(i + 1) % 12, (i + 6) % 12] for i in range(12)]
+    found = narrowed(flight, spans, partners, tmp_path / "heights.npz")
+    true = np.concatenate([hill.surface(camera, p)[..., 2].ravel() for p in around])
+    low, high = np.quantile(true, [0.001, 0.999])
+    for before, after in zip(spans, found, strict=True):
+        assert after.low < low
+        assert high < after.high
+        assert after.high - after.low < 0.6 * (before.high - before.low)
+        assert after._replace(low=before.low, high=before.high) == before
+    assert all(a.low >= b.low and a.high <= b.high for b, a in zip(spans, found, strict=True))
+    for path in tmp_path.glob("*.png"):
+        path.unlink()
+    assert narrowed(Views(flight.frames, 1600), spans, partners, tmp_path / "heights.npz") == found  # kept
+    # Where all partners stand far apart nothing is known, and nothing changes.
+    wide = [[(i + 5) % 12] for i in range(12)]
+    assert narrowed(flight, spans, wide, tmp_path / "others.npz") == spans
 
 
 def test_points_of_a_pair_that_other_pairs_contradict_are_left_out() -> None:

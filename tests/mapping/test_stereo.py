@@ -12,7 +12,7 @@ import pytest
 from overfly.errors import InputError
 from overfly.geometry import Camera, invert, look_at, pose, rotation_from_gimbal, unproject
 from overfly.mapping.consensus import consensus
-from overfly.mapping.depth_ranges import depth_ranges
+from overfly.mapping.depth_ranges import Span, depth_ranges
 from overfly.mapping.fuse import fuse
 from overfly.mapping.neighbours import choose_partners, is_wide
 from overfly.mapping.stereo import BASE_TO_HEIGHT, stereo
@@ -163,9 +163,14 @@ def test_frame_to_frame_is_projection(strips, camera) -> None:  # type: ignore[n
     assert (q[0][60, 40] + t[0] / 77) / third == pytest.approx(local[0] / local[2] * 320 + 160, abs=1e-2)
 
 
+def level(depth: float) -> Span:
+    """Level ground at z = 0, so deep in the middle of frames, which show it to three times that."""
+    return Span(0.5 * depth, depth, 3 * depth, -5.0, 0.0, 20.0)
+
+
 def test_partners_overlap_and_are_far_enough_apart(strips, camera) -> None:  # type: ignore[no-untyped-def]
     poses = [*strips, strips[0]]  # a frame twice at one place measures nothing
-    partners = choose_partners([camera] * 9, poses, [80.0] * 9, count=4, ratio=(0.04, 0.9))
+    partners = choose_partners([camera] * 9, poses, [level(80.0)] * 9, count=4, ratio=(0.04, 0.9))
     assert all(partners)
     assert 8 not in partners[0]
     assert 1 in partners[0]
@@ -181,20 +186,32 @@ def test_views_that_differ_much_are_partners_where_there_are_no_better_ones(came
         pose(rotation_from_gimbal(float(np.degrees(a)) + 180, -55.0), [125 * np.sin(a), 125 * np.cos(a), 90])
         for a in angles
     ]
-    lens = replace(camera, fx=0.9 * camera.width, fy=0.9 * camera.width)
-    wide = choose_partners([lens] * 6, ring, [110.0] * 6, count=4, ratio=BASE_TO_HEIGHT)
+    lens = replace(camera, fx=2.0 * camera.width, fy=2.0 * camera.width)  # a wide one shows far ground, too
+    wide = choose_partners([lens] * 6, ring, [level(110.0)] * 6, count=4, ratio=BASE_TO_HEIGHT)
     assert all(wide)
-    assert not any(choose_partners([lens] * 6, ring, [110.0] * 6, count=4, ratio=(0.04, 0.9)))
+    assert not any(choose_partners([lens] * 6, ring, [level(110.0)] * 6, count=4, ratio=(0.04, 0.9)))
     between = pose(rotation_from_gimbal(210.0, -55.0), [125 * np.sin(angles[1] / 2), 125 * np.cos(angles[1] / 2), 90])
-    better = choose_partners([lens] * 7, [*ring, between], [110.0] * 7, count=4, ratio=BASE_TO_HEIGHT)
+    better = choose_partners([lens] * 7, [*ring, between], [level(110.0)] * 7, count=4, ratio=BASE_TO_HEIGHT)
     assert better[0][0] == better[1][0] == 6
+
+
+def test_partners_of_oblique_frames_are_chosen_by_the_ground_that_they_show(camera) -> None:  # type: ignore[no-untyped-def]
+    """Frames of a line look ahead. What the third one shows of the first is at its top, by few pixels, far away and
+    large. As deep as the middle, it would lie behind the third camera."""
+    lens = replace(camera, fx=0.9 * camera.width, fy=0.9 * camera.width)
+    poses = [look_at([0.0, y, 90], [0.0, y + 90, 0]) for y in (0.0, 20.0, 150.0)]
+    span = Span(60.0, 127.0, 330.0, -5.0, 0.0, 20.0)
+    assert choose_partners([lens] * 3, poses, [span] * 3, count=4, ratio=BASE_TO_HEIGHT)[0] == [1, 2]
+    # Where the frame's z axis does not point up there is no level ground: all of it is taken as deep as its middle.
+    turned = [pose([[1, 0, 0], [0, -1, 0], [0, 0, -1]], [0, 0, 0]) @ p for p in poses]
+    assert choose_partners([lens] * 3, turned, [span] * 3, count=4, ratio=BASE_TO_HEIGHT)[0] == [1]
 
 
 def test_wide_partners_come_besides_those_that_already_show_the_ground(camera) -> None:  # type: ignore[no-untyped-def]
     """Eighteen images round a place: four neighbours show all of the ground, and houses hide some of it from them."""
     ring = [look_at([63 * np.sin(t), 63 * np.cos(t), 90], [0, 0, 0]) for t in np.radians(20.0 * np.arange(18))]
     lens = replace(camera, fx=0.9 * camera.width, fy=0.9 * camera.width)
-    found = choose_partners([lens] * 18, ring, [110.0] * 18, count=2, ratio=BASE_TO_HEIGHT)
+    found = choose_partners([lens] * 18, ring, [level(110.0)] * 18, count=2, ratio=BASE_TO_HEIGHT)
     for i, partners in enumerate(found):
         apart = [min((j - i) % 18, (i - j) % 18) for j in partners]
         assert max(apart[:2]) <= 4

@@ -28,20 +28,22 @@ def consensus(
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
     support = np.zeros(shape, np.uint8)
     weights = [np.where(np.isfinite(d), 1 / np.square(s), 0).astype(np.float32) for d, s in zip(depths, sigmas)]
-    known = [np.nan_to_num(d) for d in depths]
-    for i, (centre, spread) in enumerate(zip(depths, sigmas)):
-        total, mean, count = weights[i].copy(), weights[i] * known[i], (weights[i] > 0).astype(np.uint8)
-        for j, other in enumerate(depths):
-            if i == j:
-                continue
+    weighted = [w * np.nan_to_num(d) for w, d in zip(weights, depths)]
+    gate = [np.float32(gates**2) * np.square(s) for s in sigmas]
+    totals, means = [w.copy() for w in weights], [m.copy() for m in weighted]
+    counts = [(w > 0).astype(np.uint8) for w in weights]
+    for i in range(len(depths)):
+        for j in range(i + 1, len(depths)):
             with np.errstate(invalid="ignore"):
-                agrees = np.abs(other - centre) < gates * np.hypot(spread, sigmas[j])
-            w = np.where(agrees, weights[j], 0)
-            total += w
-            mean += w * known[j]
-            count += agrees
+                same = np.square(depths[j] - depths[i]) < gate[i] + gate[j]
+            agrees = same.astype(np.float32)
+            for one, other in ((i, j), (j, i)):
+                totals[one] += weights[other] * agrees
+                means[one] += weighted[other] * agrees
+                counts[one] += same
+    for weight, total, mean, count in zip(weights, totals, means, counts):
         # More supporters win; among equals, the more precise ones.
-        vote = count + total / (total + weights[i].max() + 1e-12)
+        vote = count + total / (total + weight.max() + 1e-12)
         wins = (vote > best) & (count > 0)
         best[wins] = vote[wins]
         depth[wins] = mean[wins] / total[wins]

@@ -31,7 +31,7 @@ Progress = Callable[[int, int], None]
 TILE_POINTS = 4_000_000
 """Points of all frames, before thinning, in a tile."""
 
-HELD = 8
+HELD = 16
 """Depth maps in memory."""
 
 

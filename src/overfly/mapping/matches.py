@@ -118,10 +118,10 @@ def _match(
 
 
 def _second_ring(pairs: Pairs, told: Array) -> Pairs:
-    """Pairs of frames with GPS that are not neighbours in time, nor the nearest in any direction."""
+    """Pairs of frames with GPS that do not follow one another, nor are the nearest in any direction."""
     known = np.asarray(np.isfinite(told[:, :2]).all(1))
     first = nearest_pairs(told, 1)
-    return [(i, j) for i, j in pairs if j - i > 2 and known[i] and known[j] and (i, j) not in first]
+    return [(i, j) for i, j in pairs if j - i > 1 and known[i] and known[j] and (i, j) not in first]
 
 
 def encoder_matches(

@@ -45,8 +45,8 @@ TILE_POINTS = (250_000, 4_000_000)
 SAMPLE = (500_000, 2_000_000)
 """Fewest and most points of the sample."""
 
-HELD_MAPS = (3, 8)
-"""Fewest and most depth maps in memory: with three, most are read more often."""
+HELD_MAPS = (3, 16)
+"""Fewest and most depth maps in memory: a frame has up to a dozen partners, and what is not held is read again."""
 
 MOST_GB = 6.0
 """What a map takes at most if nobody says how much it may."""

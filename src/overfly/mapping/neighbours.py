@@ -6,19 +6,23 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from overfly.geometry import Array, Camera, unproject
+from overfly.geometry import Array, Camera, rays, unproject
+from overfly.mapping.depth_ranges import Span
 
-GRID = 8
+GRID = 10
 """Samples of a frame's ground along each side of the image."""
+
+DOWN = 0.2
+"""Cosine of the angle with straight down up to which a frame is taken to look at level ground."""
 
 CANDIDATES = 40
 """Nearest cameras that are looked at."""
 
-WIDE, FURTHER = 0.9, 4
+WIDE, FURTHER = 0.9, 2
 """Base-to-height ratio from which on a pair is wide, as on circles with an image every 60 degrees: it is chosen for
 ground that no better one has. And how many wide partners a frame may have besides: they see past what hides a place
 from others (on circles over blocks 0.41 of the level ground that two images see was missing, 0.81 of it where these
-were no pair)."""
+were no pair), and are more precise, but search hundreds of disparities."""
 
 REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
 """What seeing a place once more is worth: the first partner makes it measured, the later ones make it sure."""
@@ -27,7 +31,7 @@ REPEATS = (1.0, 0.6, 0.35, 0.2, 0.1)
 def choose_partners(
     cameras: Sequence[Camera],
     poses: Sequence[Array],
-    depths: Sequence[float],
+    spans: Sequence[Span],
     *,
     count: int,
     ratio: tuple[float, float],
@@ -36,19 +40,20 @@ def choose_partners(
 
     Args:
         cameras, poses: of n frames; lenses are taken as undistorted.
-        depths: median depth of each frame's ground, metres.
+        spans: where each frame's ground lies.
         count: most partners of a frame, but for :data:`FURTHER` wide ones.
         ratio: smallest and largest base-to-height ratio.
 
     Returns:
         n lists of frame indices; empty where nothing overlaps. Partners are chosen one by one for the ground they add
-        (a greedy set cover), so that the rim of a frame gets its partner, too, also at 30 % overlap.
+        (a greedy set cover), so that the rim of a frame gets its partner, too, also at 30 % overlap. The far ground of
+        oblique frames counts by its area, not by the few pixels that show it.
     """
     centres = np.array([pose[:3, 3] for pose in poses])
     lenses = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras])
     turns = np.array([pose[:3, :3] for pose in poses])
     return [
-        _partners(i, cameras[i], poses[i], lenses, turns, centres, depths[i], count, ratio) for i in range(len(cameras))
+        _partners(i, cameras[i], poses[i], lenses, turns, centres, spans[i], count, ratio) for i in range(len(cameras))
     ]
 
 
@@ -59,13 +64,11 @@ def _partners(
     lenses: Array,
     turns: Array,
     centres: Array,
-    depth: float,
+    span: Span,
     count: int,
     ratio: tuple[float, float],
 ) -> list[int]:
-    side = (np.arange(GRID) + 0.5) / GRID
-    pixels = np.stack(np.meshgrid(side * camera.width, side * camera.height), -1).reshape(-1, 2)
-    ground = unproject(pixels, np.full(len(pixels), depth), camera, world_from_camera)
+    ground, area = _ground(camera, world_from_camera, span)
     near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[: CANDIDATES + 1]
     near = near[near != i]
     there = ground - centres[near, None]  # [J, G, 3]
@@ -77,21 +80,34 @@ def _partners(
     ratios = base_to_height(ground - centres[i], there)
     values = np.where(inside, _value(ratios, ratio), 0.0)
     wide = {int(j): far for j, far in zip(near, ratios > WIDE, strict=True)}
-    worth = {int(j): value for j, value in zip(near, values, strict=True) if value.mean() > 0.02}
+    worth = {int(j): value for j, value in zip(near, values, strict=True) if value @ area > 0.02}
     chosen: list[int] = []
-    times = np.zeros(len(ground), int)
     for more, wide_only in ((count, False), (FURTHER, True)):
-        most = len(chosen) + more
+        most, times = len(chosen) + more, np.zeros(len(ground), int)
         while worth and len(chosen) < most:
             repeat = np.array([REPEATS[min(t, len(REPEATS) - 1)] for t in times])
             counts = {j: wide[j] if wide_only else ~wide[j] | (times == 0) for j in worth}
-            gains = {j: float((value * repeat * counts[j]).mean()) for j, value in worth.items()}
+            gains = {j: float((value * repeat * counts[j]) @ area) for j, value in worth.items()}
             best = max(gains, key=lambda j: (gains[j], -j))
             if gains[best] < 0.02:
                 break
             chosen.append(best)
             times += worth.pop(best) > 0
     return chosen
+
+
+def _ground(camera: Camera, world_from_camera: Array, span: Span) -> tuple[Array, Array]:
+    """Places [N, 3] on level ground all over a frame, and the share [N] of its ground that each stands for."""
+    side = (np.arange(GRID) + 0.5) / GRID
+    pixels = np.stack(np.meshgrid(side * camera.width, side * camera.height), -1).reshape(-1, 2)
+    depth = np.full(len(pixels), span.middle)
+    if world_from_camera[2, 2] < -DOWN:
+        fall = -(rays(pixels, camera) @ world_from_camera[2, :3])
+        depth = np.full(len(pixels), span.far)
+        depth[fall > 0] = (world_from_camera[2, 3] - span.ground) / fall[fall > 0]
+        depth = np.clip(depth, span.near, span.far)
+    area = depth**3  # of a pixel on a plane that is not parallel to the image
+    return unproject(pixels, depth, camera, world_from_camera), area / area.sum()
 
 
 def base_to_height(here: Array, there: Array) -> Array:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.geometry import Array, Camera, rays
+from overfly.mapping.depth_ranges import Span
 
 Image = NDArray[np.uint8]
 
@@ -32,6 +33,11 @@ class Relief:
     low: float
     ground: float
     high: float
+
+
+def relief_of(here: Span, there: Span) -> Relief:
+    """The relief that two frames may show."""
+    return Relief(min(here.low, there.low), (here.ground + there.ground) / 2, max(here.high, there.high))
 
 
 @dataclass(frozen=True)

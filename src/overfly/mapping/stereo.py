@@ -20,14 +20,14 @@ from overfly.errors import Damaged, InputError
 from overfly.files import UNREADABLE, load_arrays, save_arrays
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, unproject
-from overfly.mapping.coarse import coarse_points
+from overfly.mapping.coarse import coarse_points, narrowed
 from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_map import DepthMap, Map, Opinion
 from overfly.mapping.depth_ranges import Span, depth_ranges
 from overfly.mapping.matcher import depth_in_frame, disparities, right_disparities
 from overfly.mapping.needs import SIZE
 from overfly.mapping.neighbours import FURTHER, choose_partners, is_wide
-from overfly.mapping.rectify import Rectified, Relief, ordered, rectify
+from overfly.mapping.rectify import Rectified, ordered, rectify, relief_of
 from overfly.mapping.subpixel import refine
 from overfly.mapping.threads import in_threads
 from overfly.mapping.views import Views
@@ -88,15 +88,19 @@ def stereo(
     flight = Views(frames, max_size)
     ranges = depth_ranges(flight.full, flight.poses, surface)
     ask = None if opinions is None else opinions(flight, surface)
-    partners = choose_partners(
-        flight.full, flight.poses, [span.middle for span in ranges], count=neighbours, ratio=BASE_TO_HEIGHT
-    )
+    partners = choose_partners(flight.full, flight.poses, ranges, count=neighbours, ratio=BASE_TO_HEIGHT)
     pairs = sorted({(min(i, j), max(i, j)) for i, chosen in enumerate(partners) for j in chosen})
+
+    def looks_wide(i: int, j: int) -> bool:
+        return is_wide(flight.full[i], flight.poses[i], ranges[i].middle, flight.poses[j])
+
     if not pairs:
         raise InputError(
             "No two frames see the same ground from places far enough apart for stereo: "
             "fly with 30 % overlap or more, or check the cameras."
         )
+    if any(looks_wide(i, j) for i, j in pairs):
+        ranges = narrowed(flight, ranges, partners, workdir / "heights.npz")
     waiting: dict[int, list[tuple[int, int]]] = {i: [] for i in range(len(frames))}
     for pair in pairs:
         for i in pair:
@@ -112,7 +116,7 @@ def stereo(
             one.result()
         # Correlate with frames that took part, the chosen ones first, wide ones last.
         took_part = partners[i] + [j for j in _all(waiting[i], i) if j not in partners[i]]
-        wide = [j for j in took_part if is_wide(flight.full[i], flight.poses[i], ranges[i].middle, flight.poses[j])]
+        wide = [j for j in took_part if looks_wide(i, j)]
         near = [j for j in took_part if j not in wide][:neighbours]
         chosen = near + wide[: neighbours + FURTHER - len(near)]
         _depth(flight, i, waiting[i], chosen, ranges, workdir, _depth_file(workdir, i), ask)
@@ -190,7 +194,7 @@ def _layout(flight: Views, pair: tuple[int, int], ranges: list[Span]) -> tuple[i
         (flight.matched_lens[i], flight.matched_lens[j]),
         (flight.poses[i], flight.poses[j]),
         ((here.near, here.far), (there.near, there.far)),
-        Relief(min(here.low, there.low), (here.ground + there.ground) / 2, max(here.high, there.high)),
+        relief_of(here, there),
     )
     return i, j, layout
 

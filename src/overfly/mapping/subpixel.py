@@ -64,7 +64,7 @@ def refine(
     with np.errstate(divide="ignore"):
         inverse = (1 / depth).astype(np.float32)
     middle = float(np.nanmedian(inverse)) if np.isfinite(inverse).any() else 1.0
-    looks = [look for shot in neighbours if (look := _look(reference, shot, inverse)) is not None]
+    looks = [look for shot in neighbours if (look := _look(reference, shot, inverse, window)) is not None]
     blank = np.full(depth.shape, -1, np.float32)
     if not looks:
         return Refined(depth.copy(), blank, np.full(depth.shape, np.nan, np.float32))
@@ -117,17 +117,25 @@ def frame_to_frame(
 
 @dataclass(frozen=True)
 class _Look:
-    """The part of the frame that a neighbour sees, with all that does not change between hypotheses."""
+    """The part of the frame that a neighbour sees, with all that does not change between hypotheses.
+
+    ``gray`` is of the frame, ``mean`` and ``deviation`` (standard, at least :data:`FAINT`) of its windows; ``unseen``
+    are pixels that the neighbour does not see, ``q`` and ``t`` as of :func:`frame_to_frame`.
+    """
 
     box: tuple[slice, slice]
     gray: Map
-    inside: NDArray[np.bool_]
+    mean: Map
+    deviation: Map
+    unseen: NDArray[np.bool_]
     q: list[Map]
     t: NDArray[np.float32]
     shot: Shot
 
 
-def _look(reference: Shot, shot: Shot, inverse: Map) -> _Look | None:
+def _look(reference: Shot, shot: Shot, inverse: Map, window: int) -> _Look | None:
+    import cv2
+
     q, t = frame_to_frame(reference.camera, reference.world_from_camera, shot.camera, shot.world_from_camera)
     with np.errstate(divide="ignore", invalid="ignore"):
         third = q[2] + inverse * t[2]
@@ -137,7 +145,10 @@ def _look(reference: Shot, shot: Shot, inverse: Map) -> _Look | None:
     if not len(rows):
         return None
     box = (slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1))
-    return _Look(box, reference.gray[box], inside[box], [np.ascontiguousarray(m[box]) for m in q], t, shot)
+    gray, *lines = (np.ascontiguousarray(m[box]) for m in (reference.gray, *q))
+    mean = np.asarray(cv2.boxFilter(gray, -1, (window, window)), np.float32)
+    square = cv2.sqrBoxFilter(gray, cv2.CV_32F, (window, window)) - mean * mean
+    return _Look(box, gray, mean, np.sqrt(np.maximum(square, np.float32(FAINT))), ~inside[box], lines, t, shot)
 
 
 def _rate(look: _Look, middle: float, width: int, height: int) -> float:
@@ -151,19 +162,26 @@ def _correlate(look: _Look, trial: Map, window: int) -> Map:
     """Zero-mean normalised correlation of the seen part and the neighbour warped by the inverse depth ``trial``."""
     import cv2
 
-    inverse, q, t = trial[look.box], look.q, look.t
-    third = 1 / (q[2] + inverse * t[2])
-    u = (q[0] + inverse * t[0]) * third - np.float32(0.5)
-    v = (q[1] + inverse * t[1]) * third - np.float32(0.5)
-    other = cv2.remap(look.shot.gray, u, v, cv2.INTER_LINEAR)
+    inverse, t, size = trial[look.box], look.t, (window, window)
+    third, u, v = (inverse * t[k] for k in (2, 0, 1))  # changed in place from here on: memory is what takes the time
+    third += look.q[2]
+    np.reciprocal(third, out=third)
+    for at, q in ((u, look.q[0]), (v, look.q[1])):
+        at += q
+        at *= third
+        at -= np.float32(0.5)
+    other = np.asarray(cv2.remap(look.shot.gray, u, v, cv2.INTER_LINEAR), np.float32)
     # Where the neighbour sees nothing, the frame itself stands in, so that windows beside it are not spoilt.
-    np.copyto(other, look.gray, where=~look.inside)
-    size = (window, window)
-    mean, other_mean = cv2.boxFilter(look.gray, -1, size), cv2.boxFilter(other, -1, size)
-    # Variances: a quarter of a gray level squared at least, so that noise on blank ground scores low.
-    spread = cv2.sqrBoxFilter(look.gray, cv2.CV_32F, size) - mean * mean
-    other_spread = cv2.sqrBoxFilter(other, cv2.CV_32F, size) - other_mean * other_mean
-    cross = cv2.boxFilter(look.gray * other, -1, size) - mean * other_mean
-    score = cross / np.sqrt(np.maximum(spread, FAINT) * np.maximum(other_spread, FAINT))
-    score[~look.inside] = -1
-    return np.asarray(score, np.float32)
+    np.copyto(other, look.gray, where=look.unseen)
+    mean = np.asarray(cv2.boxFilter(other, -1, size), np.float32)
+    deviation = np.asarray(cv2.sqrBoxFilter(other, cv2.CV_32F, size), np.float32)
+    deviation -= np.multiply(mean, mean, out=third)
+    np.maximum(deviation, np.float32(FAINT), out=deviation)
+    np.sqrt(deviation, out=deviation)
+    other *= look.gray
+    score = np.asarray(cv2.boxFilter(other, -1, size), np.float32)
+    score -= np.multiply(mean, look.mean, out=third)
+    deviation *= look.deviation
+    score /= deviation
+    np.copyto(score, np.float32(-1), where=look.unseen)
+    return score
