@@ -56,7 +56,21 @@ def test_one_small_object_does_not_tell_how_tall_all_others_are() -> None:
     assert found[90, 150] > -96
     suggested[40:56, 8:48] = 8
     assert anchored(suggested, measured)[0][90, 150] < -99
-    np.testing.assert_array_equal(found[90], anchored(suggested, measured, oblique=True)[0][90])
+
+
+def test_heights_of_which_an_oblique_image_measures_little_tell_nothing() -> None:
+    flat = np.full((180, 240), -100, np.float32)
+    measured, asked = flat.copy(), np.zeros(flat.shape, bool)
+    asked[:, :120] = True
+    measured[~asked] = np.nan
+    suggested = np.zeros_like(flat)
+    suggested[40:56, 8:48] = suggested[80:100, 140:160] = 8  # seem 8 m tall; the first is measured, and flat
+    told = anchored(suggested, measured)[0]
+    assert told[90, 150] < -99
+    np.testing.assert_array_equal(told, anchored(suggested, measured, asked)[0])
+    measured[40:50, 8:48] = np.nan  # most of it is not
+    assert anchored(suggested, measured)[0][90, 150] < -99
+    assert anchored(suggested, measured, asked)[0][90, 150] > -96
 
 
 def test_the_height_of_the_ground_is_not_the_suggestion_s_to_tell() -> None:

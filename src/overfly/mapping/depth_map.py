@@ -87,8 +87,8 @@ class Opinion:
         fall = rays(pixel_grid(width, height), camera.resized(width, height)) @ world_from_camera[2, :3]
         fall = np.minimum(fall, -0.1).astype(np.float32)  # metres down per metre of depth
         small = cv2.resize(measured, (width, height), interpolation=cv2.INTER_NEAREST)
-        oblique = is_oblique(world_from_camera)
-        heights, sure = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32), oblique)
+        asked = ~once if is_oblique(world_from_camera) else None
+        heights, sure = anchored((self.alone * fall).astype(np.float32), (small * fall).astype(np.float32), asked)
         # A slope carried on far enough passes the camera.
         depth = np.where(heights < 0, heights / fall, np.float32(np.nan))
         # The standard deviation of a Laplace distribution of which so much is right.
