@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from overfly.geometry import Camera, look_at, pixel_grid, pose, rotation_from_gimbal, unproject
-from overfly.mapping.coarse import _confirmed, coarse_points, narrowed
+from overfly.mapping.coarse import _confirmed, coarse_points
 from overfly.mapping.depth_ranges import beside_others, depth_ranges
+from overfly.mapping.seen_heights import narrowed
 from overfly.mapping.views import Views
 
 

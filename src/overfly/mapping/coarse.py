@@ -1,39 +1,23 @@
-"""First looks at low resolution: at the ground where cameras are given without any points, and at how high and how low
-the surface is where pairs look from far apart."""
+"""A first look at the ground where cameras are given without any points: few pairs at low resolution."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from overfly.errors import Damaged, InputError
-from overfly.files import load_arrays, save_arrays
+from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, unproject
 from overfly.mapping.depth_map import is_oblique
-from overfly.mapping.depth_ranges import BESIDE as VICINITY
-from overfly.mapping.depth_ranges import Span, beside_others
-from overfly.mapping.matcher import UNKNOWN, depth_in_frame, disparities
-from overfly.mapping.neighbours import is_wide
-from overfly.mapping.rectify import Relief, ordered, rectify, relief_of
-from overfly.mapping.views import Views
-
-LOOKED_AT = 400
-"""Longest side, pixels, of images that are looked at for the highest and the lowest of the surface."""
-
-PIECE, OUTER = 150, 0.001
-"""Pixels that hang together are believed there from so many on, and share of their heights at either end that is not:
-what matches wrongly, as one pixel in a hundred does, lies far above or below in small pieces."""
-
-ROOM = 0.03
-"""Share of a frame's median depth that the surface may reach beyond what was seen of it."""
+from overfly.mapping.depth_ranges import beside_others
+from overfly.mapping.matcher import UNKNOWN, Image, depth_in_frame, disparities
+from overfly.mapping.rectify import Rectified, Relief, ordered, rectify
 
 LONGEST_SIDE = 320
-DRAWN = 200
-"""Points of a pair."""
+DRAWN, LEAST_MATCHED = 200, 0.02
+"""Points of a pair, and share of its canvas without which nothing is believed."""
 
 PAIRS = 24
 """Frames of a short flight that are matched with their neighbours."""
@@ -130,16 +114,34 @@ def _matched(first: Frame, second: Frame, relief: Relief | None, rng: np.random.
     if layout is None:
         return None
     gray = [cv2.resize(_gray(f), (c.width, c.height), interpolation=cv2.INTER_AREA) for f, c in zip(pair, cameras)]
-    match = disparities((gray[0], gray[1]), (cameras[0], cameras[1]), (poses[0], poses[1]), layout)
-    if (match != UNKNOWN).mean() < 0.02:
-        return None
+    points = pair_points((gray[0], gray[1]), (cameras[0], cameras[1]), (poses[0], poses[1]), layout)
+    return points[rng.choice(len(points), DRAWN, replace=False)] if len(points) >= DRAWN else None
+
+
+def pair_points(
+    gray: tuple[Image, Image],
+    cameras: tuple[Camera, Camera],
+    poses: tuple[Array, Array],
+    layout: Rectified,
+    *,
+    piece: int = 0,
+) -> Array:
+    """What a rectified pair of small images matches, points [M, 3]; none where that is next to nothing.
+
+    Args:
+        gray, cameras, poses: of the two images, the left one first.
+        piece: pixels that must hang together to count.
+    """
+    import cv2
+
+    match = disparities(gray, cameras, poses, layout)
+    if piece:
+        cv2.filterSpeckles(match, int(UNKNOWN), piece, 32)
+    if (match != UNKNOWN).mean() < LEAST_MATCHED:
+        return np.zeros((0, 3))
     ideal = cameras[0].undistorted()
     depth = depth_in_frame(match, ideal, poses[0], layout, right=False)
     rows, columns = np.nonzero(np.isfinite(depth))
-    if len(rows) < DRAWN:
-        return None
-    pick = rng.choice(len(rows), DRAWN, replace=False)
-    rows, columns = rows[pick], columns[pick]
     return unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), depth[rows, columns], ideal, poses[0])
 
 
@@ -169,65 +171,3 @@ def _gray(frame: Frame) -> np.ndarray:
     import cv2
 
     return cv2.cvtColor(frame.image(), cv2.COLOR_RGB2GRAY)
-
-
-def narrowed(flight: Views, ranges: Sequence[Span], partners: Sequence[Sequence[int]], kept: Path) -> list[Span]:
-    """The frames' ranges of heights, no wider than what pairs show of the surface at low resolution.
-
-    Sparse points leave room for towers that they have missed. Near pairs can afford it; pairs that look from far apart
-    search hundreds of disparities for it, and find wrong ones.
-
-    Args:
-        ranges, partners: of n frames.
-        kept: file of what was found, for a run that goes on.
-    """
-    try:
-        seen = load_arrays(kept)["heights"]
-    except Damaged:
-        seen = np.array([_heights_seen(flight, ranges, i, list(partners[i])) for i in range(len(ranges))])
-        save_arrays(kept, {"heights": seen})
-    centres = np.array([pose[:3, 3] for pose in flight.poses])
-    looked = np.flatnonzero(np.isfinite(seen).all(1))
-    found = list(ranges)
-    if not len(looked):
-        return found
-    for i, span in enumerate(ranges):
-        away = np.linalg.norm(centres[looked] - centres[i], axis=1)
-        beside = seen[looked[np.argsort(away, kind="stable")[:VICINITY]]]
-        room = ROOM * span.middle
-        low, high = max(span.low, float(beside[:, 0].min()) - room), min(span.high, float(beside[:, 1].max()) + room)
-        found[i] = span._replace(low=min(low, span.ground), high=max(high, span.ground))
-    return found
-
-
-def _heights_seen(flight: Views, ranges: Sequence[Span], i: int, partners: Sequence[int]) -> tuple[float, float]:
-    """The lowest and highest z that a frame and the best of its near partners show; NaN where there is none."""
-    import cv2
-
-    near = [j for j in partners if not is_wide(flight.full[i], flight.poses[i], ranges[i].middle, flight.poses[j])]
-    nothing = float("nan"), float("nan")
-    if not near:
-        return nothing
-    pair = (i, near[0]) if ordered((flight.poses[i], flight.poses[near[0]])) else (near[0], i)
-    factor = min(1.0, LOOKED_AT / max(flight.matched[i].width, flight.matched[i].height))
-    cameras, gray = [], []
-    for k in pair:
-        whole = flight.matched_lens[k]
-        cameras.append(whole.resized(round(whole.width * factor), round(whole.height * factor)))
-        size = cameras[-1].width, cameras[-1].height
-        gray.append(np.asarray(cv2.resize(flight.matched_gray(k), size, interpolation=cv2.INTER_AREA), np.uint8))
-    lenses, poses = (cameras[0], cameras[1]), (flight.poses[pair[0]], flight.poses[pair[1]])
-    here, there = (ranges[k] for k in pair)
-    layout = rectify(lenses, poses, ((here.near, here.far), (there.near, there.far)), relief_of(here, there))
-    if layout is None:
-        return nothing
-    match = disparities((gray[0], gray[1]), lenses, poses, layout)
-    cv2.filterSpeckles(match, int(UNKNOWN), PIECE, 32)
-    ideal = lenses[0].undistorted()
-    depth = depth_in_frame(match, ideal, poses[0], layout, right=False)
-    rows, columns = np.nonzero(np.isfinite(depth))
-    if len(rows) < DRAWN:
-        return nothing
-    points = unproject(np.stack([columns + 0.5, rows + 0.5], axis=1), depth[rows, columns], ideal, poses[0])
-    low, high = np.quantile(points[:, 2], [OUTER, 1 - OUTER])
-    return float(low), float(high)

@@ -20,7 +20,7 @@ from overfly.errors import Damaged, InputError
 from overfly.files import UNREADABLE, load_arrays, save_arrays
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, unproject
-from overfly.mapping.coarse import coarse_points, narrowed
+from overfly.mapping.coarse import coarse_points
 from overfly.mapping.consensus import consensus
 from overfly.mapping.depth_map import DepthMap, Map, Opinion
 from overfly.mapping.depth_ranges import Span, depth_ranges
@@ -28,6 +28,7 @@ from overfly.mapping.matcher import depth_in_frame, disparities, right_dispariti
 from overfly.mapping.needs import SIZE
 from overfly.mapping.neighbours import FURTHER, choose_partners, is_wide
 from overfly.mapping.rectify import Rectified, ordered, rectify, relief_of
+from overfly.mapping.seen_heights import narrowed
 from overfly.mapping.subpixel import refine
 from overfly.mapping.threads import in_threads
 from overfly.mapping.views import Views
