@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from overfly.files import save_arrays
 from overfly.geometry import Camera, look_at, pixel_grid, pose, rotation_from_gimbal, unproject
 from overfly.mapping.coarse import _confirmed, coarse_points
 from overfly.mapping.depth_ranges import beside_others, depth_ranges
@@ -45,7 +46,7 @@ def test_what_pairs_show_narrows_the_heights_that_are_searched(camera: Camera, h
     points = hill.surface(camera, around[0])[::20, ::20].reshape(-1, 3)
     spans = depth_ranges(flight.full, flight.poses, points)
     partners = [[(i + 1) % 12, (i + 6) % 12] for i in range(12)]
-    found = narrowed(flight, spans, partners, tmp_path / "heights.npz")
+    found = narrowed(flight, spans, partners, range(12), tmp_path / "heights.npz")
     true = np.concatenate([hill.surface(camera, p)[..., 2].ravel() for p in around])
     low, high = np.quantile(true, [0.001, 0.999])
     for before, after in zip(spans, found, strict=True):
@@ -56,10 +57,19 @@ def test_what_pairs_show_narrows_the_heights_that_are_searched(camera: Camera, h
     assert all(a.low >= b.low and a.high <= b.high for b, a in zip(spans, found, strict=True))
     for path in tmp_path.glob("*.png"):
         path.unlink()
-    assert narrowed(Views(flight.frames, 1600), spans, partners, tmp_path / "heights.npz") == found  # kept
+    assert narrowed(Views(flight.frames, 1600), spans, partners, range(12), tmp_path / "heights.npz") == found  # kept
     # Where all partners stand far apart nothing is known, and nothing changes.
     wide = [[(i + 5) % 12] for i in range(12)]
-    assert narrowed(flight, spans, wide, tmp_path / "others.npz") == spans
+    assert narrowed(flight, spans, wide, range(12), tmp_path / "others.npz") == spans
+    # Nor where nobody has looked, nor where the land may be of any height.
+    unknown = spans[1]._replace(low=-np.inf, high=np.inf)
+    mixed = [spans[0], unknown, *spans[2:]]
+    seen = np.load(tmp_path / "heights.npz")["heights"]
+    seen[0] = np.nan
+    save_arrays(tmp_path / "some.npz", {"heights": seen})
+    some = narrowed(flight, mixed, partners, range(12), tmp_path / "some.npz")
+    assert some[:2] == mixed[:2]
+    assert some[2:] == found[2:]
 
 
 def test_points_of_a_pair_that_other_pairs_contradict_are_left_out() -> None:

@@ -207,6 +207,44 @@ def test_partners_of_oblique_frames_are_chosen_by_the_ground_that_they_show(came
     assert choose_partners([lens] * 3, turned, [span] * 3, count=4, ratio=BASE_TO_HEIGHT)[0] == [1]
 
 
+def test_sky_and_ground_out_of_reach_choose_no_partner(camera) -> None:  # type: ignore[no-untyped-def]
+    """Two fifths of a flat view are beyond the farthest surface point: they weighed nine tenths."""
+    lens = replace(camera, fx=0.9 * camera.width, fy=0.9 * camera.width)
+    flat = [pose(rotation_from_gimbal(0.0, -15.0), [x, y, 60.0]) for y in (0.0, 25.0, 50.0, 300.0) for x in (0.0, 25.0)]
+    span = Span(60.0, 200.0, 400.0, -5.0, 0.0, 20.0)
+    assert set(choose_partners([lens] * 8, flat, [span] * 8, count=2, ratio=BASE_TO_HEIGHT)[0][:2]) <= {1, 2, 3}
+    # Ground over the camera is no ground: all is as deep as the middle, where the next but one is still a partner.
+    over = Span(30.0, 100.0, 300.0, 50.0, 70.0, 90.0)
+    line = [pose(rotation_from_gimbal(90.0, -25.0), [0.0, 10.0 * k, 60.0]) for k in range(5)]
+    assert choose_partners([lens] * 5, line, [over] * 5, count=4, ratio=BASE_TO_HEIGHT)[0][0] == 2
+
+
+@pytest.mark.parametrize("step", [12.0, 24.0])
+def test_frames_that_look_down_have_no_wide_partners(camera, step: float) -> None:  # type: ignore[no-untyped-def]
+    poses = [pose(rotation_from_gimbal(0.0, -90.0), [step * x, step * y, 60.0]) for y in range(5) for x in range(5)]
+    found = choose_partners([camera] * 25, poses, [level(60.0)] * 25, count=4, ratio=BASE_TO_HEIGHT)
+    assert all(0 < len(partners) <= 4 for partners in found)
+
+
+def test_wide_pairs_search_what_near_ones_show(hill, camera, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    around = [look_at([60 * np.sin(t), 60 * np.cos(t), 80], [0, 0, 0]) for t in np.radians(range(0, 360, 30))]
+    frames = hill.frames(tmp_path, camera, around, known=True)
+    points = hill.surface(camera, around[0])[::20, ::20].reshape(-1, 3)
+    searched: list[tuple[float, float]] = []
+    from overfly.mapping import stereo as module
+
+    def noted(flight, pair, ranges, matched=module._layout):  # type: ignore[no-untyped-def]
+        searched.append((ranges[pair[0]].low, ranges[pair[0]].high))
+        return matched(flight, pair, ranges)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_layout", noted)
+        stereo(frames, workdir=tmp_path / "work", points=points)
+    assert (tmp_path / "work" / "heights.npz").is_file()
+    widths = {round(high - low, 1) for low, high in searched}
+    assert max(widths) > 1.6 * min(widths)  # near pairs keep the room that the points leave
+
+
 def test_wide_partners_come_besides_those_that_already_show_the_ground(camera) -> None:  # type: ignore[no-untyped-def]
     """Eighteen images round a place: four neighbours show all of the ground, and houses hide some of it from them."""
     ring = [look_at([63 * np.sin(t), 63 * np.cos(t), 90], [0, 0, 0]) for t in np.radians(20.0 * np.arange(18))]

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Map = NDArray[np.float32]
 
+ROWS = 64
+"""Rows worked on at once: all pairs of many maps take memory."""
+
 
 def consensus(
     depths: Sequence[Map], sigmas: Sequence[Map], *, gates: float = 3.0
@@ -23,6 +26,21 @@ def consensus(
     Returns:
         depth and sigma [H, W] (NaN where no pair knows anything), and the number of supporting pairs [H, W].
     """
+    shape = depths[0].shape
+    depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
+    support = np.zeros(shape, np.uint8)
+    tops = [float(np.max(1 / np.square(s), initial=0, where=np.isfinite(d))) for d, s in zip(depths, sigmas)]
+    for start in range(0, shape[0], ROWS):
+        rows = slice(start, start + ROWS)
+        band = [d[rows] for d in depths], [s[rows] for s in sigmas]
+        depth[rows], sigma[rows], support[rows] = _of_rows(*band, tops, gates)
+    return depth, sigma, support
+
+
+def _of_rows(
+    depths: Sequence[Map], sigmas: Sequence[Map], tops: Sequence[float], gates: float
+) -> tuple[Map, Map, NDArray[np.uint8]]:
+    """The consensus of some rows; ``tops`` are the largest weights of the whole maps."""
     shape = depths[0].shape
     best = np.zeros(shape, np.float32)
     depth, sigma = np.full(shape, np.nan, np.float32), np.full(shape, np.nan, np.float32)
@@ -41,9 +59,9 @@ def consensus(
                 totals[one] += weights[other] * agrees
                 means[one] += weighted[other] * agrees
                 counts[one] += same
-    for weight, total, mean, count in zip(weights, totals, means, counts):
+    for top, total, mean, count in zip(tops, totals, means, counts):
         # More supporters win; among equals, the more precise ones.
-        vote = count + total / (total + weight.max() + 1e-12)
+        vote = count + total / (total + np.float32(top) + np.float32(1e-12))
         wins = (vote > best) & (count > 0)
         best[wins] = vote[wins]
         depth[wins] = mean[wins] / total[wins]

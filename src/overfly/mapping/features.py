@@ -79,7 +79,7 @@ def image_pairs(
         progress: called with (coarse pairs compared, in all), where that is needed.
 
     Frames with GPS get the nearest others in each of eight directions, so that strips connect; frames without are
-    compared with all others by their few hundred coarsest key points. Neighbours in time are always matched.
+    compared with all others by their few hundred coarsest key points. The next two in time are pairs, too.
     """
     n = len(descriptors)
     if n <= SMALL_FLIGHT:

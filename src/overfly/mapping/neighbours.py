@@ -84,9 +84,15 @@ def _partners(
     chosen: list[int] = []
     for more, wide_only in ((count, False), (FURTHER, True)):
         most, times = len(chosen) + more, np.zeros(len(ground), int)
+        if wide_only:  # all over what it shows, not in a corner
+            worth = {
+                j: value
+                for j, value in worth.items()
+                if (area * wide[j])[value > 0].sum() > 0.5 * area[value > 0].sum()
+            }
         while worth and len(chosen) < most:
             repeat = np.array([REPEATS[min(t, len(REPEATS) - 1)] for t in times])
-            counts = {j: wide[j] if wide_only else ~wide[j] | (times == 0) for j in worth}
+            counts = {j: wide_only | ~wide[j] | (times == 0) for j in worth}
             gains = {j: float((value * repeat * counts[j]) @ area) for j, value in worth.items()}
             best = max(gains, key=lambda j: (gains[j], -j))
             if gains[best] < 0.02:
@@ -97,16 +103,17 @@ def _partners(
 
 
 def _ground(camera: Camera, world_from_camera: Array, span: Span) -> tuple[Array, Array]:
-    """Places [N, 3] on level ground all over a frame, and the share [N] of its ground that each stands for."""
+    """Places [N, 3] on level ground all over a frame, and the share [N] of its ground that each stands for: none of the
+    sky, and of what is farther than the span."""
     side = (np.arange(GRID) + 0.5) / GRID
     pixels = np.stack(np.meshgrid(side * camera.width, side * camera.height), -1).reshape(-1, 2)
-    depth = np.full(len(pixels), span.middle)
-    if world_from_camera[2, 2] < -DOWN:
+    depth, area = np.full(len(pixels), span.middle), np.ones(len(pixels))
+    over, down = world_from_camera[2, 3] - span.ground, -world_from_camera[2, 2]
+    if down > DOWN and span.near < over / down < span.far:  # else the z axis points elsewhere than up
         fall = -(rays(pixels, camera) @ world_from_camera[2, :3])
-        depth = np.full(len(pixels), span.far)
-        depth[fall > 0] = (world_from_camera[2, 3] - span.ground) / fall[fall > 0]
-        depth = np.clip(depth, span.near, span.far)
-    area = depth**3  # of a pixel on a plane that is not parallel to the image
+        seen = fall > over / span.far
+        depth = np.where(seen, np.maximum(over / np.where(seen, fall, 1), span.near), span.far)
+        area = np.where(seen, depth**3, 0)  # of a pixel on a plane
     return unproject(pixels, depth, camera, world_from_camera), area / area.sum()
 
 

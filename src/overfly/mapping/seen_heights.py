@@ -13,6 +13,7 @@ from overfly.mapping.coarse import pair_points
 from overfly.mapping.depth_ranges import BESIDE, Span
 from overfly.mapping.neighbours import is_wide
 from overfly.mapping.rectify import ordered, rectify, relief_of
+from overfly.mapping.threads import in_threads
 from overfly.mapping.views import Views
 
 LOOKED_AT = 400
@@ -26,27 +27,41 @@ ROOM = 0.03
 """Share of a frame's median depth that the surface may reach beyond what was seen of it."""
 
 
-def narrowed(flight: Views, ranges: Sequence[Span], partners: Sequence[Sequence[int]], kept: Path) -> list[Span]:
+def narrowed(
+    flight: Views,
+    ranges: Sequence[Span],
+    partners: Sequence[Sequence[int]],
+    asked: Sequence[int],
+    kept: Path,
+    workers: int = 1,
+) -> list[Span]:
     """The frames' ranges of heights, no wider than what pairs show of the surface at low resolution.
 
-    Sparse points leave room for towers that they have missed. Near pairs can afford it; pairs that look from far apart
-    search hundreds of disparities for it, and find wrong ones.
+    Sparse points leave room for towers that they have missed. Near pairs search it; pairs that look from far apart
+    would search hundreds of disparities for it, and find wrong ones.
 
     Args:
         ranges, partners: of n frames.
+        asked: frames that have a wide partner; ranges of others, and of those of which nothing is seen or whose heights
+            are not known at all, stay as they are.
         kept: file of what was found, for a run that goes on.
+        workers: frames that are looked at side by side.
     """
     try:
         seen = load_arrays(kept)["heights"]
     except Damaged:
-        seen = np.array([_heights_seen(flight, ranges, i, list(partners[i])) for i in range(len(ranges))])
+        seen = np.full((len(ranges), 2), np.nan)
+        with in_threads(workers) as pool:
+            looks = [pool.submit(_heights_seen, flight, ranges, i, partners[i]) for i in asked]
+            seen[list(asked)] = [look.result() for look in looks]
         save_arrays(kept, {"heights": seen})
     centres = np.array([pose[:3, 3] for pose in flight.poses])
     looked = np.flatnonzero(np.isfinite(seen).all(1))
     found = list(ranges)
-    if not len(looked):
-        return found
-    for i, span in enumerate(ranges):
+    for i in looked.tolist():
+        span = ranges[i]
+        if not np.isfinite([span.low, span.high]).all():
+            continue
         away = np.linalg.norm(centres[looked] - centres[i], axis=1)
         beside = seen[looked[np.argsort(away, kind="stable")[:BESIDE]]]
         room = ROOM * span.middle
@@ -64,10 +79,10 @@ def _heights_seen(flight: Views, ranges: Sequence[Span], i: int, partners: Seque
     if not near:
         return nothing
     pair = (i, near[0]) if ordered((flight.poses[i], flight.poses[near[0]])) else (near[0], i)
-    factor = min(1.0, LOOKED_AT / max(flight.matched[i].width, flight.matched[i].height))
     cameras, gray = [], []
     for k in pair:
         whole = flight.matched_lens[k]
+        factor = min(1.0, LOOKED_AT / max(whole.width, whole.height))
         cameras.append(whole.resized(round(whole.width * factor), round(whole.height * factor)))
         size = cameras[-1].width, cameras[-1].height
         gray.append(np.asarray(cv2.resize(flight.matched_gray(k), size, interpolation=cv2.INTER_AREA), np.uint8))

@@ -100,8 +100,10 @@ def stereo(
             "No two frames see the same ground from places far enough apart for stereo: "
             "fly with 30 % overlap or more, or check the cameras."
         )
-    if any(looks_wide(i, j) for i, j in pairs):
-        ranges = narrowed(flight, ranges, partners, workdir / "heights.npz")
+    wide_pairs = {(i, j) for i, j in pairs if looks_wide(i, j) or looks_wide(j, i)}
+    asked_of = sorted({i for pair in wide_pairs for i in pair})
+    narrow = narrowed(flight, ranges, partners, asked_of, workdir / "heights.npz", workers) if wide_pairs else ranges
+    searched = {pair: narrow if pair in wide_pairs else ranges for pair in pairs}
     waiting: dict[int, list[tuple[int, int]]] = {i: [] for i in range(len(frames))}
     for pair in pairs:
         for i in pair:
@@ -110,7 +112,7 @@ def stereo(
 
     def match(pair: tuple[int, int]) -> None:
         if not _pair_file(workdir, pair).is_file():
-            _match(flight, pair, ranges, workdir)
+            _match(flight, pair, searched[pair], workdir)
 
     def measure(i: int, ready: Sequence[Future[None]]) -> None:
         for one in ready:  # they were asked for before, so that somebody is at them or has done them
@@ -120,7 +122,8 @@ def stereo(
         wide = [j for j in took_part if looks_wide(i, j)]
         near = [j for j in took_part if j not in wide][:neighbours]
         chosen = near + wide[: neighbours + FURTHER - len(near)]
-        _depth(flight, i, waiting[i], chosen, ranges, workdir, _depth_file(workdir, i), ask)
+        matched = [(pair, searched[pair]) for pair in waiting[i]]
+        _depth(flight, i, matched, chosen, ranges[i], workdir, _depth_file(workdir, i), ask)
 
     asked = [i for i in range(len(frames)) if waiting[i]]
     with in_threads(workers) as pool:
@@ -240,9 +243,9 @@ def _at_full_size(
 def _depth(
     flight: Views,
     i: int,
-    pairs: list[tuple[int, int]],
+    pairs: list[tuple[tuple[int, int], list[Span]]],
     chosen: list[int],
-    ranges: list[Span],
+    span: Span,
     workdir: Path,
     path: Path,
     ask: Opinions | None,
@@ -252,8 +255,8 @@ def _depth(
 
     depths: list[Map] = []
     sigmas: list[Map] = []
-    floor = ranges[i].floor(flight.matched[i], flight.poses[i])
-    for pair in pairs:
+    floor = span.floor(flight.matched[i], flight.poses[i])
+    for pair, ranges in pairs:
         match = np.load(_pair_file(workdir, pair))
         left, _, layout = _layout(flight, pair, ranges)
         if layout is None or not match.size:

@@ -119,7 +119,7 @@ def frame_to_frame(
 class _Look:
     """The part of the frame that a neighbour sees, with all that does not change between hypotheses.
 
-    ``gray`` is of the frame, ``mean`` and ``deviation`` (standard, at least :data:`FAINT`) of its windows; ``unseen``
+    ``gray`` is of the frame, ``mean`` and ``deviation`` (the root of at least :data:`FAINT`) of its windows; ``unseen``
     are pixels that the neighbour does not see, ``q`` and ``t`` as of :func:`frame_to_frame`.
     """
 
