@@ -34,6 +34,9 @@ from overfly.scenes import STYLES
 from overfly.tables import markdown, write_rows
 
 
+USUAL = ["grid-30", "grid-50", "circular-50", "circular-80"]
+
+
 def run_map(case: Case, folder: Path, dense: str, network: str | None) -> dict[str, Any]:
     """Map a flight in a process of its own, on one thread, and return what it took.
 
@@ -127,7 +130,13 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("outputs/flights"))
     parser.add_argument("--styles", nargs="+", choices=STYLES, default=["blocks", "suburb", "village"])
     parser.add_argument("--scene", nargs="+", default=[], help="scene files, flown over instead of the styles")
-    parser.add_argument("--cells", nargs="+", choices=CELLS, default=list(CELLS), help="paths and overlaps")
+    parser.add_argument(
+        "--cells",
+        nargs="+",
+        choices=CELLS,
+        default=["grid-30", "grid-50", "circular-50", "circular-80"],
+        help="paths and overlaps",
+    )
     parser.add_argument("--altitudes", nargs="+", type=float, default=[150.0], help="metres")
     parser.add_argument("--dense", nargs="+", choices=("stereo", "sweep", "exact"), default=["stereo"])
     parser.add_argument("--network", help="a run folder for sweep; without it the shipped network")

@@ -30,7 +30,7 @@ from overfly.mapping.walls import CONFIDENCE
 from overfly.shipped import load_network
 from overfly.tables import markdown
 
-CELLS |= {"circular-80": ("circular", 80), "double_grid-50": ("double_grid", 50), "random-50": ("random", 50)}
+CELLS |= {"double_grid-50": ("double_grid", 50), "random-50": ("random", 50)}
 FLIGHTS = (
     ("campus", "grid-50", 300), ("campus", "circular-80", 120), ("blocks", "grid-30", 80), ("blocks", "random-50", 120),
     ("suburb", "grid-50", 200), ("suburb", "circular-50", 100), ("village", "grid-80", 80), ("village", "grid-30", 150),
