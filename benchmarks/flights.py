@@ -33,7 +33,6 @@ from overfly.metrics.functional import THRESHOLDS_M
 from overfly.scenes import STYLES
 from overfly.tables import markdown, write_rows
 
-
 USUAL = ["grid-30", "grid-50", "circular-50", "circular-80"]
 
 
