@@ -255,6 +255,8 @@ def test_an_interrupted_matching_goes_on_with_the_same_pairs(tmp_path: Path, mon
     (first, rest), _ = asked_with([(0, 2)])
     assert not set(first) & set(rest)
     assert 0 < len(rest) < len(set(pairs) - set(first))
+    assert {(i, i + 1) for i in range(14)} <= set(first)
+    assert not {(i, i + 2) for i in range(13)} & set(first)  # the next of a line lies between them
     again, _ = asked_with(rest)
     assert again == [first, rest]
     assert told[0] == told[1] == set(first)

@@ -106,7 +106,7 @@ def _matched(first: Frame, second: Frame, relief: Relief | None, rng: np.random.
     poses = [np.asarray(f.world_from_camera, float) for f in pair]
     if not ordered((poses[0], poses[1])):
         pair, poses = pair[::-1], poses[::-1]
-    cameras = [_small(f) for f in pair]
+    cameras = [small(f.camera, LONGEST_SIDE) for f in pair if f.camera is not None]
     baseline = float(np.linalg.norm(poses[0][:3, 3] - poses[1][:3, 3]))
     reach = cameras[0].fx * baseline / cameras[0].width
     span = (reach / 0.9, reach / 0.02)
@@ -161,10 +161,10 @@ def _confirmed(points: Array, pair: NDArray[np.intp], off: float) -> NDArray[np.
     return np.isin(np.arange(len(points)), left)
 
 
-def _small(frame: Frame) -> Camera:
-    assert frame.camera is not None
-    factor = min(1.0, LONGEST_SIDE / max(frame.width, frame.height))
-    return frame.camera.resized(round(frame.width * factor), round(frame.height * factor))
+def small(camera: Camera, longest: int) -> Camera:
+    """The camera with so many pixels on its longest side, or as many as it has."""
+    factor = min(1.0, longest / max(camera.width, camera.height))
+    return camera.resized(round(camera.width * factor), round(camera.height * factor))
 
 
 def _gray(frame: Frame) -> np.ndarray:

@@ -22,6 +22,7 @@ from overfly.mapping.compared import Partner
 from overfly.mapping.depth_map import DepthMap
 from overfly.mapping.frame_points import cleaned, frame_points
 from overfly.mapping.layout import Layout, laid_out, reach
+from overfly.mapping.needs import HELD_MAPS
 from overfly.mapping.parts import RECORD, Part, cloud_of, read_part, read_squares, write_part
 from overfly.mapping.thinning import MARGIN, thinned_tile, voxels, within
 from overfly.mapping.tiles import Tiles, finished, write_tile, written_tile
@@ -30,9 +31,6 @@ Progress = Callable[[int, int], None]
 
 TILE_POINTS = 4_000_000
 """Points of all frames, before thinning, in a tile."""
-
-HELD = 16
-"""Depth maps in memory."""
 
 
 def fuse(
@@ -44,7 +42,7 @@ def fuse(
     single: bool = True,
     walls: bool = False,
     tile_points: int = TILE_POINTS,
-    held: int = HELD,
+    held: int = HELD_MAPS[1],
     progress: Progress | None = None,
     progress_of_tiles: Progress | None = None,
 ) -> Tiles:

@@ -9,7 +9,7 @@ import numpy as np
 
 from overfly.errors import Damaged
 from overfly.files import load_arrays, save_arrays
-from overfly.mapping.coarse import pair_points
+from overfly.mapping.coarse import pair_points, small
 from overfly.mapping.depth_ranges import BESIDE, Span
 from overfly.mapping.neighbours import is_wide
 from overfly.mapping.rectify import ordered, rectify, relief_of
@@ -81,9 +81,7 @@ def _heights_seen(flight: Views, ranges: Sequence[Span], i: int, partners: Seque
     pair = (i, near[0]) if ordered((flight.poses[i], flight.poses[near[0]])) else (near[0], i)
     cameras, gray = [], []
     for k in pair:
-        whole = flight.matched_lens[k]
-        factor = min(1.0, LOOKED_AT / max(whole.width, whole.height))
-        cameras.append(whole.resized(round(whole.width * factor), round(whole.height * factor)))
+        cameras.append(small(flight.matched_lens[k], LOOKED_AT))
         size = cameras[-1].width, cameras[-1].height
         gray.append(np.asarray(cv2.resize(flight.matched_gray(k), size, interpolation=cv2.INTER_AREA), np.uint8))
     lenses, poses = (cameras[0], cameras[1]), (flight.poses[pair[0]], flight.poses[pair[1]])
