@@ -110,6 +110,7 @@ def test_what_is_read_may_be_typed(overrides: str) -> None:
     [
         ("overlap=[30,50", "type KEY=VALUE"),
         ("stage", "'stage' cannot be read: type KEY=VALUE"),
+        ("=3", "no key before its =, or a number where a name is meant"),
         ("seed=abc", "from 0 to 4294967295"),
         ("seed=-1", "from 0 to 4294967295"),
         ("seed=1.5", "from 0 to 4294967295"),

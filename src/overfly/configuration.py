@@ -105,6 +105,11 @@ def explain(error: BaseException) -> str | None:
             f"{error.override!r} cannot be read: type KEY=VALUE without spaces around the =, and lists, braces and "
             "spaces in quotes, for instance stage=gan 'overlap=[30,50]'."
         )
+    if isinstance(error, ValueError) and text.startswith("Config group override must be"):  # Hydra's word for `=3`
+        return (
+            "An override has no key before its =, or a number where a name is meant: type KEY=VALUE, for instance "
+            "stage=gan overlap=50."
+        )
     if isinstance(error, MissingConfigException):
         return text
     if found := re.search(r"Could not override '([^'@]+)'", text):
