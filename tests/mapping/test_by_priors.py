@@ -9,8 +9,10 @@ import pytest
 from two_lines import CAMERA, Block
 
 from overfly.geometry import Array, fit_similarity, pose, project, rotation_from_gimbal
+from overfly.mapping.adjustment import adjusted
 from overfly.mapping.bundle import Bundle, components
 from overfly.mapping.by_priors import bundle_by_priors
+from overfly.mapping.calibration import held_by_images
 from overfly.mapping.guided import guided_matches
 from overfly.mapping.overlays import Prior
 from overfly.mapping.placing import agrees_with_gps, placed, tilted
@@ -145,6 +147,59 @@ def test_parts_without_common_points_are_told_apart() -> None:
     found = bundle_by_priors(block.frames, block.told, blank, matches, [1] * 8)
     assert found is not None
     assert [part.frames.tolist() for part in components(found)] == [[3, 4, 5, 6, 7], [0, 1, 2]]
+
+
+@pytest.mark.parametrize(("shared", "placed_too"), [(9, False), (14, True)])
+def test_an_image_is_not_placed_by_what_few_points_it_shares(shared: int, placed_too: bool) -> None:
+    block = Block()
+    matches = {pair: rows for pair, rows in block.common(20).items() if 7 not in pair or pair == (6, 7)}
+    matches[6, 7] = matches[6, 7][:shared]
+    blank = [(pixels, np.zeros_like(looks)) for pixels, looks in block.features]
+    found = bundle_by_priors(block.frames, block.told, blank, matches, [1] * 8)
+    assert found is not None
+    assert found.frames.tolist() == [*range(7), *([7] if placed_too else [])]
+
+
+def test_headings_hold_what_hardly_any_point_does() -> None:
+    """Frame 7 has no points, and starts with a heading that is 8 degrees wrong."""
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    at = placed([found], block.frames, block.told, [])
+    turned = at.bundle.rotations.copy()
+    turned[7] = turned[7] @ rotation_from_gimbal(8, 0) @ rotation_from_gimbal(0, 0).T
+    start = replace(at.bundle, rotations=turned).kept(at.bundle.image != 7)
+    held = replace(held_by_images(start, block.frames), ups=at.ups, places=at.places, place_sigmas=at.sigmas)
+    off = []
+    for norths in (at.norths, held.norths):
+        norths_then = adjusted(start, replace(held, norths=norths)).bundle.rotations[7][:, 1]
+        off.append(np.degrees(np.linalg.norm(norths_then - at.norths[7])))
+    assert off[0] < 0.1
+    assert off[1] > 5
+
+
+def test_headings_that_the_block_contradicts_hold_nothing() -> None:
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    backwards = [
+        replace(f, gimbal=(f.gimbal[0] + 180 * (k < 3), *f.gimbal[1:])) for k, f in enumerate(block.frames) if f.gimbal
+    ]
+    backwards[4] = replace(backwards[4], gimbal=None)
+    norths = placed([found], backwards, block.told, []).norths
+    known = np.isfinite(norths).all(1)
+    assert known.tolist() == [False, False, False, True, False, True, True, True]
+
+
+def test_headings_are_told_without_the_error_of_the_compass() -> None:
+    """All gimbals turned by 10 degrees tell the same norths, and as GPS places the block."""
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    turned = [replace(f, gimbal=(f.gimbal[0] + 10, *f.gimbal[1:])) for f in block.frames if f.gimbal]
+    at, again = (placed([found], frames, block.told, []) for frames in (block.frames, turned))
+    np.testing.assert_allclose(again.norths, at.norths, atol=1e-3)
+    assert np.degrees(np.linalg.norm(at.norths - at.bundle.rotations[:, :, 1], axis=1)).max() < 3
 
 
 def test_a_bundle_without_an_image() -> None:

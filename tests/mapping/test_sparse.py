@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from overfly.errors import InputError
 from overfly.flights import Flight, Frame
 from overfly.mapping import sparse
 from overfly.mapping.agreement import Agreement
@@ -17,8 +18,9 @@ from overfly.mapping.agreement import Agreement
 class Part:
     """A bundle, as far as the choice looks at it."""
 
-    def __init__(self, name: str, images: int, error: float = 0.2) -> None:
+    def __init__(self, name: str, images: int, error: float = 0.2, rays: int = 60) -> None:
         self.name, self.images, self.error = name, images, error
+        self.image = np.repeat(np.arange(images), rays)
 
     def __len__(self) -> int:
         return self.images
@@ -70,7 +72,7 @@ def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_neede
         return prior
 
     monkeypatch.setattr(sparse, "mapped", mapped)
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: agrees)
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_: agrees or part.name == "prior")
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
     monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(20, bool)))
     monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 20)
@@ -217,3 +219,31 @@ def test_cameras_by_priors_replace_a_model_that_contradicts_gps(
 ) -> None:
     parts: Any = Part("new", new), Part("old", old)
     assert sparse._better(*parts, agrees, trusted) == taken
+
+
+@pytest.mark.parametrize(("rays", "agrees", "refused"), [(49, False, True), (50, False, False), (8, True, False)])
+def test_a_model_of_few_points_that_contradicts_gps_is_refused(
+    rays: int, agrees: bool, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cameras by priors contradict GPS, too, so that they do not take its place."""
+    model = Part("held", 6, rays=rays)
+    monkeypatch.setattr(sparse, "mapped", lambda *_, **__: [model])
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: agrees)
+    monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
+    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(6, bool)))
+    monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 6)
+    monkeypatch.setattr(sparse, "upheld", lambda part, _: len(part))
+    monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: Part("prior", 6))
+    monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
+    flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(6)])
+
+    def parts() -> Any:
+        return sparse.sparse_parts(
+            tmp_path / "db", flight, [], np.zeros((6, 3)), tmp_path, 0, lambda *_: nullcontext(lambda *_: None), []
+        )
+
+    if refused:
+        with pytest.raises(InputError, match=r"49 points in the median image\) contradicts GPS"):
+            parts()
+    else:
+        assert parts() == [model]

@@ -129,8 +129,9 @@ def _held_block(
             warnings.append(f"{error} The map has no metric scale.")
     apart: list[str] = []
     if at is not None:
-        result = adjusted_twice(at.bundle, replace(held_by_images(at.bundle, flight.frames), ups=at.ups,
-                                places=at.places, place_sigmas=at.sigmas, lever=True), flight.frames)  # fmt: skip
+        held = replace(held_by_images(at.bundle, flight.frames), ups=at.ups, norths=at.norths)
+        held = replace(held, places=at.places, place_sigmas=at.sigmas, lever=True)
+        result = adjusted_twice(at.bundle, held, flight.frames)
         _remark_scale(at.places[:, :2], at.sigmas[:, :2], warnings)
         apart = [flight.frames[i].name for i in at.apart]
         own = [flight.frames[i] for i in result.bundle.frames]

@@ -15,7 +15,7 @@ from overfly.flights import Frame
 from overfly.geometry import Array, rotation_from_gimbal
 from overfly.mapping.adjustment import adjusted
 from overfly.mapping.bundle import Bundle, Index
-from overfly.mapping.calibration import LOOSE, ROUGHLY, held_by_images
+from overfly.mapping.calibration import ROUGHLY, held_by_images
 from overfly.mapping.database import focal_px
 from overfly.mapping.overlays import Prior
 from overfly.mapping.placing import gps_sigmas
@@ -25,11 +25,14 @@ from overfly.mapping.relative import unit_px
 FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
 """What a ray is taken to be worth, pixels, one adjustment after another: at first directions are wrong by a degree."""
 
-UP_SIGMA_DEG = 3.0
-"""What the gimbal's vertical is taken to be worth: a few wrong matches shall not tilt an image."""
+LOOSE = 3.0
+"""Factor on the standard deviation of GPS: hardly more, or a few wrong matches carry an image away."""
 
 FEWEST_RAYS = 8
 """Rays without which an image is not placed: three tell its pose, the others that they are right."""
+
+FEWEST_SHARED = 10
+"""Points that two images must share, or what they alone see is dropped: up to 9 were wrong on orbits over towers."""
 
 FARTHEST_PX = 6.0
 """Rays that miss their point by more at the end are dropped."""
@@ -91,8 +94,8 @@ def bundle_by_priors(
     rows = first_matches(start, own, rows, [priors[i] for i in known] if priors else [], seed, progress)
     if not rows:
         return None
-    ups = start.rotations[:, :, 2]
-    bundle = _fitted(start, own, rows, frames, places, sigmas, ups, FIRST_SIGMAS_PX)
+    turns = start.rotations
+    bundle = _fitted(start, own, rows, frames, places, sigmas, turns, FIRST_SIGMAS_PX)
     if len(bundle.points) < FEWEST_RAYS:
         return None
     seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
@@ -102,10 +105,24 @@ def bundle_by_priors(
         rotations=np.where(seen[:, None, None], bundle.rotations, start.rotations),
         centres=np.where(seen[:, None], bundle.centres, start.centres + shift),
     )
-    bundle = _fitted(bundle, own, more_matches(bundle, own, rows, progress), frames, places, sigmas, ups, SIGMAS_PX)
+    bundle = _fitted(bundle, own, more_matches(bundle, own, rows, progress), frames, places, sigmas, turns, SIGMAS_PX)
+    bundle = _without_weak_ties(bundle)
     while len(bundle) and (few := np.bincount(bundle.image, minlength=len(bundle)) < FEWEST_RAYS).any():
         bundle = bundle.without(few)
     return bundle if len(bundle) >= 2 else None
+
+
+def _without_weak_ties(bundle: Bundle) -> Bundle:
+    """Without what only two images see that share few points: so few agree by chance."""
+    shared = np.zeros((len(bundle), len(bundle)), int)
+    for pair, count in bundle.links().items():
+        shared[pair] = count
+    seen = np.bincount(bundle.point, minlength=len(bundle.points))
+    lowest, highest = np.full(len(seen), len(bundle)), np.zeros(len(seen), int)
+    np.minimum.at(lowest, bundle.point, bundle.image)
+    np.maximum.at(highest, bundle.point, bundle.image)
+    weak = (seen == 2) & (shared[lowest, highest] < FEWEST_SHARED)
+    return bundle.kept(~weak[bundle.point])
 
 
 def _fitted(
@@ -115,7 +132,7 @@ def _fitted(
     frames: Sequence[Frame],
     places: Array,
     place_sigmas: Array,
-    ups: Array,
+    turns: Array,
     sigmas_px: Sequence[float],
 ) -> Bundle:
     """Cameras adjusted to the tracks of matches, from where they are."""
@@ -131,8 +148,8 @@ def _fitted(
             pixel_sigma=np.full(len(bundle.image), sigma),
             places=places,
             place_sigmas=place_sigmas,
-            ups=ups,
-            up_sigma=np.radians(UP_SIGMA_DEG),
+            ups=turns[:, :, 2],
+            norths=turns[:, :, 1],
             lens_fixed=np.ones(len(bundle.lenses), bool),
         )
         bundle = adjusted(bundle, held, tolerance=ROUGHLY).bundle

@@ -34,6 +34,9 @@ TILTED_DEG, LEVEL_DEG, FEWEST_GIMBALS = 20.0, 5.0, 4
 """An image whose vertical is so far from the gimbals' is placed wrongly, if half of so many at least are less far off.
 Headings are not asked: Brighton's gimbals tell those of one line the other way round."""
 
+TURNED_DEG = 20.0
+"""A heading that is so far from the block's is wrong, or the image is."""
+
 UNKNOWN_M = 1e3
 """Standard deviation of a height of which nothing is known."""
 
@@ -54,6 +57,8 @@ class Placed:
         sigmas: their standard deviations [n, 3], metres.
         ups: the vertical in camera axes [n, 3]: by the gimbals, which level a small block as well as GPS does; of
             images without one, where GPS does not level the block, as it stands; NaN for the others.
+        norths: north in camera axes [n, 3], by the gimbals against one another; NaN where the block says something
+            else.
         apart: frames that no common points but GPS alone connects to the largest part.
     """
 
@@ -61,6 +66,7 @@ class Placed:
     places: Array
     sigmas: Array
     ups: Array
+    norths: Array
     apart: NDArray[np.intp]
 
 
@@ -76,7 +82,7 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
     Raises:
         InputError: GPS does not scale the largest part.
     """
-    done: list[tuple[Bundle, Array, Array, Array]] = []
+    done: list[tuple[Bundle, Array, Array, Array, Array]] = []
     for number, part in enumerate(parts):
         own = [frames[i] for i in part.frames]
         gimbals, places = [frame.gimbal for frame in own], told[part.frames]
@@ -105,12 +111,12 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
         if np.isnan(places[:, 2]).all():  # the heights stay as they are, so that the equations are regular
             places[:, 2] = np.where(np.isfinite(places[:, 0]), part.centres[:, 2], np.nan)
             sigmas[:, 2] = UNKNOWN_M
-        done.append((part, places, sigmas, ups))
+        done.append((part, places, sigmas, ups, _norths(part, gimbals)))
     numbers = np.concatenate([part.frames for part, *_ in done])
     order = np.argsort(numbers, kind="stable")
     bundle = merged([part for part, *_ in done])
-    places, sigmas, ups = (np.concatenate([parts[i] for parts in done])[order] for i in (1, 2, 3))
-    return Placed(bundle, places, sigmas, ups, apart=np.sort(numbers[len(done[0][0]) :]))
+    places, sigmas, ups, norths = (np.concatenate([parts[i] for parts in done])[order] for i in (1, 2, 3, 4))
+    return Placed(bundle, places, sigmas, ups, norths, apart=np.sort(numbers[len(done[0][0]) :]))
 
 
 def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame]) -> bool:
@@ -203,6 +209,24 @@ def _ups(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None], *
         if gimbal is not None:
             ups[k] = rotation_from_gimbal(*gimbal)[2]
     return ups
+
+
+def _norths(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
+    """North in camera axes [n, 3] by the gimbals, the error that all of them have in common taken out.
+
+    Some tell that of a whole line the other way round. The error in common is the compass's; GPS turns the block.
+    """
+    norths = np.full((len(bundle), 3), np.nan)
+    turns = {k: rotation_from_gimbal(*gimbal) for k, gimbal in enumerate(gimbals) if gimbal is not None}
+    off = {k: (bundle.world_from_camera[k] @ turn.T)[:2, 0] for k, turn in turns.items()}  # where its east lies
+    by = {k: float(np.arctan2(north, east)) for k, (east, north) in off.items()}
+    near = {k: angle for k, angle in by.items() if abs(angle) < np.deg2rad(TURNED_DEG)}
+    if near:
+        common = float(np.median(list(near.values())))
+        turned = np.array([np.sin(common), np.cos(common), 0.0])
+        for k in near:
+            norths[k] = turned @ turns[k]
+    return norths
 
 
 def gps_sigmas(frames: Sequence[Frame]) -> Array:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from overfly.errors import InputError
 from overfly.flights import Flight
 from overfly.geometry import Array
 from overfly.mapping.agreement import Agreement, agreement, rewritten
@@ -33,6 +34,9 @@ GPS, if they are at least so many times as many."""
 
 WORSE = 2.0
 """Times by which reprojection errors may be larger where more images are placed."""
+
+FEWEST_RAYS = 50
+"""Points of its median image from which on a model is believed although it contradicts GPS: less agrees by chance."""
 
 GOOD_PX = 0.5
 """Errors are compared with so much at least: those of a few wrong points may be zero."""
@@ -81,6 +85,9 @@ def sparse_parts(
         bar: (step, unit) -> context manager of a function that takes (done, total).
         warnings: for the user.
         more: makes a database of more matches.
+
+    Raises:
+        InputError: all that was found contradicts GPS, and is too little to be believed.
     """
     names = [frame.name for frame in flight.frames]
     calibrated = all(frame.calibration is not None for frame in flight.frames)
@@ -153,8 +160,11 @@ def sparse_parts(
         )
     parts = [] if prior is None else components(prior)
     trusted = found is not None and found.believed.mean() >= TRUSTED
+    if parts and not agrees_with_gps(parts[0], told, flight.frames):
+        parts = []
     if not parts or (best.parts and not _better(parts[0], best.parts[0], best.agrees, trusted)):
         warnings += remark
+        _refuse_chance(best)
         return best.parts
     left = len(names) - (len(best.parts[0]) if best.parts else 0)
     failed = f"left out {left} of {len(names)} images"
@@ -167,6 +177,19 @@ def sparse_parts(
         "block."
     )
     return parts
+
+
+def _refuse_chance(best: _Start) -> None:
+    """Raise where a model contradicts GPS and too few points hold its images together."""
+    if not best.parts or best.agrees:
+        return
+    model = best.parts[0]
+    if (usual := int(np.median(np.bincount(model.image, minlength=len(model))))) < FEWEST_RAYS:
+        raise InputError(
+            f"The images share too little to be placed: what {len(model)} of them have in common ({usual} points in "
+            "the median image) contradicts GPS and gimbals, and so few agree by chance. Give images that overlap by "
+            "60 % or more."
+        )
 
 
 def _better(new: Bundle, old: Bundle, agrees: bool, trusted: bool) -> bool:
