@@ -9,10 +9,10 @@ import pytest
 from two_lines import CAMERA, Block
 
 from overfly.geometry import Array, fit_similarity, pose, project, rotation_from_gimbal
-from overfly.mapping.adjustment import adjusted
+from overfly.mapping.adjustment import UP_SIGMA, adjusted
 from overfly.mapping.bundle import Bundle, components
 from overfly.mapping.by_priors import bundle_by_priors
-from overfly.mapping.calibration import held_by_images
+from overfly.mapping.calibration import NORMAL, RAYLEIGH, gimbal_sigma, held_by_images
 from overfly.mapping.guided import guided_matches
 from overfly.mapping.overlays import Prior
 from overfly.mapping.placing import agrees_with_gps, placed, tilted
@@ -171,9 +171,9 @@ def test_headings_hold_what_hardly_any_point_does() -> None:
     start = replace(at.bundle, rotations=turned).kept(at.bundle.image != 7)
     held = replace(held_by_images(start, block.frames), ups=at.ups, places=at.places, place_sigmas=at.sigmas)
     off = []
-    for norths in (at.norths, held.norths):
-        norths_then = adjusted(start, replace(held, norths=norths)).bundle.rotations[7][:, 1]
-        off.append(np.degrees(np.linalg.norm(norths_then - at.norths[7])))
+    for easts in (at.easts, held.easts):
+        north = adjusted(start, replace(held, easts=easts)).bundle.rotations[7][:, 1]
+        off.append(np.degrees(np.abs(north @ at.easts[7])))
     assert off[0] < 0.1
     assert off[1] > 5
 
@@ -186,20 +186,65 @@ def test_headings_that_the_block_contradicts_hold_nothing() -> None:
         replace(f, gimbal=(f.gimbal[0] + 180 * (k < 3), *f.gimbal[1:])) for k, f in enumerate(block.frames) if f.gimbal
     ]
     backwards[4] = replace(backwards[4], gimbal=None)
-    norths = placed([found], backwards, block.told, []).norths
-    known = np.isfinite(norths).all(1)
+    known = np.isfinite(placed([found], backwards, block.told, []).easts).all(1)
     assert known.tolist() == [False, False, False, True, False, True, True, True]
 
 
 def test_headings_are_told_without_the_error_of_the_compass() -> None:
-    """All gimbals turned by 10 degrees tell the same norths, and as GPS places the block."""
+    """All gimbals turned by 10 degrees tell the same easts, and as GPS places the block."""
     block = Block()
     found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
     assert found is not None
     turned = [replace(f, gimbal=(f.gimbal[0] + 10, *f.gimbal[1:])) for f in block.frames if f.gimbal]
     at, again = (placed([found], frames, block.told, []) for frames in (block.frames, turned))
-    np.testing.assert_allclose(again.norths, at.norths, atol=1e-3)
-    assert np.degrees(np.linalg.norm(at.norths - at.bundle.rotations[:, :, 1], axis=1)).max() < 3
+    np.testing.assert_allclose(again.easts, at.easts, atol=1e-3)
+    assert np.degrees(np.linalg.norm(at.easts - at.bundle.rotations[:, :, 0], axis=1)).max() < 3
+
+
+@pytest.mark.parametrize(
+    ("turned_deg", "tilted_deg", "rays", "left_out"),
+    [(0, 6, 40, True), (8, 0, 40, True), (0, 6, 400, False), (8, 0, 400, False), (0, 1, 40, False)],
+)
+def test_an_image_of_few_rays_that_contradicts_its_gimbal_is_left_out(
+    turned_deg: float, tilted_deg: float, rays: int, left_out: bool
+) -> None:
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(200), [1] * 8)
+    assert found is not None
+    rotations = found.rotations.copy()
+    rotations[3] = rotations[3] @ rotation_from_gimbal(turned_deg, tilted_deg) @ rotation_from_gimbal(0, 0).T
+    own = np.flatnonzero(found.image == 3)
+    assert len(own) > 150
+    wrong = replace(found, rotations=rotations)
+    if rays < len(own):
+        wrong = wrong.kept(~np.isin(np.arange(len(found.image)), own[rays:]))
+    warnings: list[str] = []
+    at = placed([wrong], block.frames, block.told, warnings)
+    assert at.bundle.frames.tolist() == [k for k in range(8) if k != 3 or not left_out]
+    assert len(at.places) == len(at.easts) == len(at.bundle)
+    assert bool([w for w in warnings if "1 images (3.jpg) were left out" in w]) == left_out
+
+
+def test_an_image_of_few_rays_whose_heading_is_told_backwards_stays() -> None:
+    block = Block()
+    found = bundle_by_priors(block.frames, block.told, block.features, block.common(12), [1] * 8)
+    assert found is not None
+    few = found.kept((found.image != 7) | (np.cumsum(found.image == 7) <= 60))
+    backwards = [
+        replace(f, gimbal=(f.gimbal[0] + 180 * (k == 7), *f.gimbal[1:])) for k, f in enumerate(block.frames) if f.gimbal
+    ]
+    assert placed([few], backwards, block.told, []).bundle.frames.tolist() == list(range(8))
+
+
+def test_gimbals_weigh_what_they_scatter_by() -> None:
+    """Those that are far better than usual hold more, down to a fifth of a degree; of a few nothing is told."""
+    rng = np.random.default_rng(0)
+    for true, expected in ((0.5, 0.5), (0.01, 0.2), (3.0, 1.3)):
+        off = np.deg2rad(true) * np.linalg.norm(rng.normal(size=(300, 2)), axis=1) / RAYLEIGH
+        assert np.rad2deg(gimbal_sigma(off, UP_SIGMA)) == pytest.approx(expected, rel=0.1)
+        one = np.deg2rad(true) * np.abs(rng.normal(size=300)) / NORMAL
+        assert np.rad2deg(gimbal_sigma(one, UP_SIGMA)) == pytest.approx(expected, rel=0.15)
+        assert gimbal_sigma(off[:7], UP_SIGMA) == UP_SIGMA
 
 
 def test_a_bundle_without_an_image() -> None:

@@ -34,8 +34,8 @@ LEVER_SIGMA_M = 0.3
 UP_SIGMA = np.deg2rad(1.3)
 """Of a vertical by the gimbal: what its readings scatter by against the images on a real flight."""
 
-NORTH_SIGMA = np.deg2rad(3.0)
-"""Of north by the gimbal, which a compass tells it."""
+HEADING_SIGMA = np.deg2rad(3.0)
+"""Of a heading by the gimbal, which a compass tells it."""
 
 MOST_STEPS = 60
 FREE_STEP = 1e-9
@@ -52,8 +52,8 @@ class Held:
     Attributes:
         pixel_sigma: standard deviation of a ray [k], pixels.
         places, place_sigmas: GPS positions of the images [n, 3] and their standard deviations, metres.
-        ups: the vertical in camera axes [n, 3], unit length, with ``up_sigma`` in radians.
-        norths: the same of north, with :data:`NORTH_SIGMA`.
+        ups: the vertical in camera axes [n, 3], unit length, with ``up_sigma`` in radians, of each [n] or of all.
+        easts: the same of east; only headings are held by it, with ``heading_sigma``.
         focals: focal lengths by the photos' data [c], pixels, with ``focal_sigma`` as a share [c], or of all.
         lens_sigma: standard deviation of k1 and k2 about zero.
         lens_fixed: cameras that keep their calibration [c].
@@ -66,12 +66,13 @@ class Held:
     places: Array
     place_sigmas: Array
     ups: Array
-    norths: Array
+    easts: Array
     focals: Array
     lens_fixed: NDArray[np.bool_]
     knows: Array
     know_sigmas: Array
-    up_sigma: float = UP_SIGMA
+    up_sigma: Array | float = UP_SIGMA
+    heading_sigma: Array | float = HEADING_SIGMA
     focal_sigma: Array | float = 0.02
     lens_sigma: float = LENS_SIGMA
     lever: bool = False
@@ -86,7 +87,7 @@ def free(bundle: Bundle, pixel_sigma: Array | float) -> Held:
         places=np.full((n, 3), np.nan),
         place_sigmas=np.ones((n, 3)),
         ups=np.full((n, 3), np.nan),
-        norths=np.full((n, 3), np.nan),
+        easts=np.full((n, 3), np.nan),
         focals=np.full(c, np.nan),
         lens_fixed=np.zeros(c, bool),
         knows=np.full((m, 3), np.nan),
@@ -234,12 +235,16 @@ def _rows(state: Adjusted) -> Rows:
         columns = [6 * k + 3 + axis, *(6 * k + i for i in range(3)), *(lever + i for i in range(3)), datum + axis]
         values = [1.0, *by_turn[axis], *world[k][axis], 1.0]
         rows.add(away[k, axis] / s, columns, np.array(values) / s, huber=HUBER)
-    for told, axis_told, sigma in ((held.ups, 2, held.up_sigma), (held.norths, 1, NORTH_SIGMA)):
-        for k in np.flatnonzero(np.isfinite(told).all(1)).tolist():
-            seen = b.rotations[k][:, axis_told]
-            off, by_turn = (seen - told[k]) / sigma, -skew(seen[None])[0] / sigma
-            for axis in range(3):
-                rows.add(off[axis], [6 * k + i for i in range(3)], by_turn[axis], huber=HUBER)
+    sigmas = np.broadcast_to(held.up_sigma, n)
+    for k in np.flatnonzero(np.isfinite(held.ups).all(1)).tolist():
+        off = (b.rotations[k][:, 2] - held.ups[k]) / sigmas[k]
+        by_turn = -skew(b.rotations[k][:, 2][None])[0] / sigmas[k]
+        for axis in range(3):
+            rows.add(off[axis], [6 * k + i for i in range(3)], by_turn[axis], huber=HUBER)
+    sigmas = np.broadcast_to(held.heading_sigma, n)
+    for k in np.flatnonzero(np.isfinite(held.easts).all(1) & np.isfinite(sigmas)).tolist():
+        east, north = held.easts[k] / sigmas[k], b.rotations[k][:, 1]  # at right angles, were there no error
+        rows.add(east @ north, [6 * k + i for i in range(3)], -east @ skew(north[None])[0], huber=HUBER)
     for j in range(c):
         column = first_lens + LENS * j
         if held.lens_fixed[j]:

@@ -129,7 +129,7 @@ def _held_block(
             warnings.append(f"{error} The map has no metric scale.")
     apart: list[str] = []
     if at is not None:
-        held = replace(held_by_images(at.bundle, flight.frames), ups=at.ups, norths=at.norths)
+        held = replace(held_by_images(at.bundle, flight.frames), ups=at.ups, easts=at.easts)
         held = replace(held, places=at.places, place_sigmas=at.sigmas, lever=True)
         result = adjusted_twice(at.bundle, held, flight.frames)
         _remark_scale(at.places[:, :2], at.sigmas[:, :2], warnings)

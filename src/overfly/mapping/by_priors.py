@@ -149,7 +149,7 @@ def _fitted(
             places=places,
             place_sigmas=place_sigmas,
             ups=turns[:, :, 2],
-            norths=turns[:, :, 1],
+            easts=turns[:, :, 0],
             lens_fixed=np.ones(len(bundle.lenses), bool),
         )
         bundle = adjusted(bundle, held, tolerance=ROUGHLY).bundle

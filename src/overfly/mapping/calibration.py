@@ -11,12 +11,12 @@ import numpy as np
 
 from overfly.flights import Frame
 from overfly.geometry import Array, Camera, distort, invertible, pixel_grid, rays, undistort
-from overfly.mapping.adjustment import LENS_SIGMA, Adjusted, Held, adjusted, free
+from overfly.mapping.adjustment import HEADING_SIGMA, LENS_SIGMA, UP_SIGMA, Adjusted, Held, adjusted, free
 from overfly.mapping.bundle import Bundle
 from overfly.mapping.database import focal_px
 from overfly.mapping.features import LONGEST_SIDE
 from overfly.mapping.model import FEWEST_TO_CALIBRATE
-from overfly.mapping.placing import widened
+from overfly.mapping.placing import FEW_RAYS, widened
 from overfly.mapping.ties import unchecked_ties, untied
 
 UNTOLD = "The images do not tell the focal length"
@@ -55,6 +55,13 @@ NO_LENS_SIGMA = 0.0001
 LOOSE = 10.0
 """Factor on the standard deviation of GPS until it has shown what it is worth."""
 
+LEAST_DEG, FEWEST_TO_JUDGE = 0.2, 8
+"""Degrees that gimbals are taken to scatter by at the least, and how many must show that they scatter by less than is
+usual."""
+
+NORMAL, RAYLEIGH = 0.6745, 1.1774
+"""Median size of a normal value of standard deviation 1, and length of two."""
+
 HOPELESS, PATIENCE = 20, 5
 """Steps that gain less than this part of what must be gained in all are the last ones after so many of them."""
 
@@ -81,21 +88,38 @@ def held_by_images(bundle: Bundle, frames: Sequence[Frame]) -> Held:
 
 
 def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjusted:
-    """Adjusted, then again without the rays that miss, and with GPS weighed by what it turned out to be worth."""
+    """Adjusted, then again without the rays that miss, and with GPS weighed by what it turned out to be worth.
+
+    Headings hold only images of few rays, and gimbals that scatter little hold these more than others: errors that
+    gimbals have in common would bend a block that its rays hold better.
+    """
     # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
+    few = np.bincount(bundle.image, minlength=len(bundle)) < FEW_RAYS
+    held = replace(held, heading_sigma=np.where(few, HEADING_SIGMA, np.inf))
     loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
     result = adjusted(bundle, loose, tolerance=ROUGHLY)
     kept = result.bundle.kept(result.bundle.errors() <= WORST_PX * _shrunk(bundle, frames))
     kept = kept.kept(~unchecked_ties(kept, np.asarray(np.isfinite(held.places[:, :2]).all(1))))
     images = free(kept, NOISE_PX * _shrunk(kept, frames))
+    tilted = np.linalg.norm(kept.rotations[:, :, 2] - held.ups, axis=1)
+    turned = np.abs((kept.rotations[:, :, 1] * held.easts).sum(1))
     again = replace(
         held,
         pixel_sigma=images.pixel_sigma,
         knows=images.knows,
         know_sigmas=images.know_sigmas,
         place_sigmas=widened(held.place_sigmas, result.away()),
+        up_sigma=np.where(few, gimbal_sigma(tilted / RAYLEIGH, UP_SIGMA), UP_SIGMA),
+        heading_sigma=np.where(few, gimbal_sigma(turned / NORMAL, HEADING_SIGMA), np.inf),
     )
     return adjusted(kept, again, lever=result.lever, tolerance=ROUGHLY)
+
+
+def gimbal_sigma(off: Array, most: float) -> float:
+    """Standard deviation, radians, of what gimbals are off [n] (NaN: not told), each by its usual share of one."""
+    if np.isfinite(off).sum() < FEWEST_TO_JUDGE:
+        return most
+    return min(most, max(np.deg2rad(LEAST_DEG), float(np.nanmedian(off))))
 
 
 def _shrunk(bundle: Bundle, frames: Sequence[Frame]) -> Array:

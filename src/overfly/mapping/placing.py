@@ -37,6 +37,12 @@ Headings are not asked: Brighton's gimbals tell those of one line the other way 
 TURNED_DEG = 20.0
 """A heading that is so far from the block's is wrong, or the image is."""
 
+FEW_RAYS, FEWEST_TO_SCATTER = 150, 8
+"""Rays from which on an image is believed against its gimbal, and gimbals that tell what is usual."""
+
+SCATTERED, LEAST_OFF_DEG = 5.0, 2.0
+"""Times as far off its gimbal's direction as is usual, and degrees, beyond which an image of few rays is wrong."""
+
 UNKNOWN_M = 1e3
 """Standard deviation of a height of which nothing is known."""
 
@@ -57,7 +63,7 @@ class Placed:
         sigmas: their standard deviations [n, 3], metres.
         ups: the vertical in camera axes [n, 3]: by the gimbals, which level a small block as well as GPS does; of
             images without one, where GPS does not level the block, as it stands; NaN for the others.
-        norths: north in camera axes [n, 3], by the gimbals against one another; NaN where the block says something
+        easts: east in camera axes [n, 3], by the gimbals against one another; NaN where the block says something
             else.
         apart: frames that no common points but GPS alone connects to the largest part.
     """
@@ -66,7 +72,7 @@ class Placed:
     places: Array
     sigmas: Array
     ups: Array
-    norths: Array
+    easts: Array
     apart: NDArray[np.intp]
 
 
@@ -100,6 +106,13 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
                 "say: wrong matches have placed them, or these gimbals are wrong. Look at the picture of the block, "
                 "and fly with more overlap."
             )
+        if (wrong := by_chance(part, gimbals)).any() and (~wrong).sum() >= 2:
+            warnings.append(
+                f"{some_of(wrong, own)} were left out: they share few points with others, and these contradict their "
+                "gimbals. Fly with more overlap there."
+            )
+            part, places = part.without(wrong), places[~wrong]
+            own, gimbals = ([each for each, bad in zip(of, wrong, strict=True) if not bad] for of in (own, gimbals))
         clean = without_faults(part, places, own, warnings)
         if np.isnan(clean).sum() > np.isnan(places).sum() and np.isfinite(clean[:, :2]).all(1).sum() >= 2:
             part = part.moved(by_gps(part.centres, clean, gimbals, part.world_from_camera))
@@ -111,12 +124,12 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
         if np.isnan(places[:, 2]).all():  # the heights stay as they are, so that the equations are regular
             places[:, 2] = np.where(np.isfinite(places[:, 0]), part.centres[:, 2], np.nan)
             sigmas[:, 2] = UNKNOWN_M
-        done.append((part, places, sigmas, ups, _norths(part, gimbals)))
+        done.append((part, places, sigmas, ups, _easts(part, gimbals)))
     numbers = np.concatenate([part.frames for part, *_ in done])
     order = np.argsort(numbers, kind="stable")
     bundle = merged([part for part, *_ in done])
-    places, sigmas, ups, norths = (np.concatenate([parts[i] for parts in done])[order] for i in (1, 2, 3, 4))
-    return Placed(bundle, places, sigmas, ups, norths, apart=np.sort(numbers[len(done[0][0]) :]))
+    places, sigmas, ups, easts = (np.concatenate([parts[i] for parts in done])[order] for i in (1, 2, 3, 4))
+    return Placed(bundle, places, sigmas, ups, easts, apart=np.sort(numbers[len(done[0][0]) :]))
 
 
 def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame]) -> bool:
@@ -150,6 +163,29 @@ def tilted(bundle: Bundle, frames: Sequence[Frame]) -> NDArray[np.bool_]:
     angles = np.rad2deg(np.arccos(np.clip(ups @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
     if np.median(angles) < LEVEL_DEG:
         wrong[known] = angles > TILTED_DEG
+    return wrong
+
+
+def by_chance(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> NDArray[np.bool_]:
+    """Which images [n] of few rays are turned otherwise than their gimbals say, by far more than the others are.
+
+    Some dozen wrong matches agree by chance on a pose that is off by degrees, and outweigh any prior.
+    """
+    told = [k for k, gimbal in enumerate(gimbals) if gimbal is not None]
+    wrong = np.zeros(len(bundle), bool)
+    if len(told) < FEWEST_TO_SCATTER:
+        return wrong
+    turns = np.stack([rotation_from_gimbal(*(gimbals[k] or (0, 0, 0))) for k in told])
+    off = bundle.world_from_camera[told] @ turns.transpose(0, 2, 1)  # all alike, were there no errors
+    few = np.bincount(bundle.image, minlength=len(bundle))[told] < FEW_RAYS
+    for column in (2, 0):  # where the gimbals' up lies, and their east
+        directions = off[:, :, column]
+        middle = np.median(directions, axis=0)
+        angles = np.rad2deg(np.arccos(np.clip(directions @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
+        if column == 0:  # those of a whole line may be told the other way round
+            angles = np.minimum(angles, 180 - angles)
+        usual = float(np.median(angles))
+        wrong[np.array(told)[few & (angles > max(LEAST_OFF_DEG, SCATTERED * usual))]] = True
     return wrong
 
 
@@ -211,22 +247,22 @@ def _ups(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None], *
     return ups
 
 
-def _norths(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
-    """North in camera axes [n, 3] by the gimbals, the error that all of them have in common taken out.
+def _easts(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
+    """East in camera axes [n, 3] by the gimbals, the error that all of them have in common taken out.
 
     Some tell that of a whole line the other way round. The error in common is the compass's; GPS turns the block.
     """
-    norths = np.full((len(bundle), 3), np.nan)
+    easts = np.full((len(bundle), 3), np.nan)
     turns = {k: rotation_from_gimbal(*gimbal) for k, gimbal in enumerate(gimbals) if gimbal is not None}
     off = {k: (bundle.world_from_camera[k] @ turn.T)[:2, 0] for k, turn in turns.items()}  # where its east lies
     by = {k: float(np.arctan2(north, east)) for k, (east, north) in off.items()}
     near = {k: angle for k, angle in by.items() if abs(angle) < np.deg2rad(TURNED_DEG)}
     if near:
         common = float(np.median(list(near.values())))
-        turned = np.array([np.sin(common), np.cos(common), 0.0])
+        turned = np.array([np.cos(common), -np.sin(common), 0.0])
         for k in near:
-            norths[k] = turned @ turns[k]
-    return norths
+            easts[k] = turned @ turns[k]
+    return easts
 
 
 def gps_sigmas(frames: Sequence[Frame]) -> Array:
