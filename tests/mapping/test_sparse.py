@@ -72,7 +72,7 @@ def test_the_better_start_is_taken_and_the_dear_one_only_tried_where_it_is_neede
         return prior
 
     monkeypatch.setattr(sparse, "mapped", mapped)
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_: agrees or part.name == "prior")
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_, **__: agrees or part.name == "prior")
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
     monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(20, bool)))
     monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 20)
@@ -121,7 +121,7 @@ def test_more_matches_are_asked_for_where_they_are_too_few(
     monkeypatch.setattr(
         sparse, "mapped", lambda database, *_, **__: [p] if (p := by_database[database.name]) is not None else []
     )
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_: part.name != against)
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_, **__: part.name != against)
     monkeypatch.setattr(sparse, "read_points", lambda database, _: (read.append(database.name), []))
     monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(20, bool)))
     monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 20)
@@ -187,7 +187,7 @@ def test_models_are_made_of_what_agrees_with_the_priors_and_must_keep_it(
     monkeypatch.setattr(sparse, "rewritten", rewritten)
     monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, dropped, added, np.ones(20, bool)))
     monkeypatch.setattr(sparse, "upheld", lambda part, _: min(kept, len(part)))
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: True)
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_, **__: True)
     monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 20)
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
     prior = PRIOR if kept < 20 else None
@@ -221,14 +221,14 @@ def test_cameras_by_priors_replace_a_model_that_contradicts_gps(
     assert sparse._better(*parts, agrees, trusted) == taken
 
 
-@pytest.mark.parametrize(("rays", "agrees", "refused"), [(49, False, True), (50, False, False), (8, True, False)])
+@pytest.mark.parametrize(("rays", "agrees", "refused"), [(49, False, True), (50, False, False), (49, True, False)])
 def test_a_model_of_few_points_that_contradicts_gps_is_refused(
     rays: int, agrees: bool, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cameras by priors contradict GPS, too, so that they do not take its place."""
-    model = Part("held", 6, rays=rays)
+    model = Part("held", 5, rays=rays)
     monkeypatch.setattr(sparse, "mapped", lambda *_, **__: [model])
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda *_: agrees)
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_, **__: agrees and part is model)
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
     monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(6, bool)))
     monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 6)
@@ -247,3 +247,21 @@ def test_a_model_of_few_points_that_contradicts_gps_is_refused(
             parts()
     else:
         assert parts() == [model]
+
+
+def test_fewer_cameras_by_priors_that_agree_replace_a_model_of_few_points_that_contradicts_gps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sparse, "mapped", lambda *_, **__: [Part("held", 6, rays=20)])
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_, **__: part.name == "prior")
+    monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
+    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(6, bool)))
+    monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 6)
+    monkeypatch.setattr(sparse, "upheld", lambda part, _: len(part))
+    monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: Part("prior", 5))
+    monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
+    flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(6)])
+    parts: Any = sparse.sparse_parts(
+        tmp_path / "db", flight, [], np.zeros((6, 3)), tmp_path, 0, lambda *_: nullcontext(lambda *_: None), []
+    )
+    assert [part.name for part in parts] == ["prior"]

@@ -20,7 +20,7 @@ CAUCHY = 2.0
 """Residuals above this many standard deviations lose their weight: images and controls' pixels."""
 
 HUBER = 2.8
-"""The same of GPS and verticals, whose weight falls more gently (the 95 % bound of three normal values)."""
+"""The same of GPS, verticals and headings, whose weight falls more gently (the 95 % bound of three normal values)."""
 
 FIXED = 1e-7
 """Standard deviation of what is not estimated."""
@@ -53,7 +53,8 @@ class Held:
         pixel_sigma: standard deviation of a ray [k], pixels.
         places, place_sigmas: GPS positions of the images [n, 3] and their standard deviations, metres.
         ups: the vertical in camera axes [n, 3], unit length, with ``up_sigma`` in radians, of each [n] or of all.
-        easts: the same of east; only headings are held by it, with ``heading_sigma``.
+        easts: the same of east; only headings are held by it, with ``heading_sigma``. One that is told the
+            other way round costs nothing.
         focals: focal lengths by the photos' data [c], pixels, with ``focal_sigma`` as a share [c], or of all.
         lens_sigma: standard deviation of k1 and k2 about zero.
         lens_fixed: cameras that keep their calibration [c].

@@ -18,14 +18,14 @@ from overfly.mapping.bundle import Bundle, Index
 from overfly.mapping.calibration import ROUGHLY, held_by_images
 from overfly.mapping.database import focal_px
 from overfly.mapping.overlays import Prior
-from overfly.mapping.placing import gps_sigmas
+from overfly.mapping.placing import easts_of, gps_sigmas
 from overfly.mapping.prior_matches import Features, Verified, first_matches, more_matches
 from overfly.mapping.relative import unit_px
 
 FIRST_SIGMAS_PX, SIGMAS_PX = (40.0, 10.0, 2.5), (10.0, 2.5)
 """What a ray is taken to be worth, pixels, one adjustment after another: at first directions are wrong by a degree."""
 
-LOOSE = 3.0
+GPS_LOOSE = 3.0
 """Factor on the standard deviation of GPS: hardly more, or a few wrong matches carry an image away."""
 
 FEWEST_RAYS = 8
@@ -90,12 +90,13 @@ def bundle_by_priors(
         point=np.zeros(0, np.intp),
         pixels=np.zeros((0, 2)),
     )
-    places, sigmas = told[known], gps_sigmas([frames[i] for i in known]) * LOOSE
+    places, sigmas = told[known], gps_sigmas([frames[i] for i in known]) * GPS_LOOSE
     rows = first_matches(start, own, rows, [priors[i] for i in known] if priors else [], seed, progress)
     if not rows:
         return None
-    turns = start.rotations
-    bundle = _fitted(start, own, rows, frames, places, sigmas, turns, FIRST_SIGMAS_PX)
+    bundle = _fitted(
+        start, own, rows, frames, places, sigmas, start.rotations[:, :, 2], start.rotations[:, :, 0], FIRST_SIGMAS_PX
+    )
     if len(bundle.points) < FEWEST_RAYS:
         return None
     seen = np.bincount(bundle.image, minlength=len(bundle)) > 0
@@ -105,7 +106,8 @@ def bundle_by_priors(
         rotations=np.where(seen[:, None, None], bundle.rotations, start.rotations),
         centres=np.where(seen[:, None], bundle.centres, start.centres + shift),
     )
-    bundle = _fitted(bundle, own, more_matches(bundle, own, rows, progress), frames, places, sigmas, turns, SIGMAS_PX)
+    more, easts = more_matches(bundle, own, rows, progress), easts_of(bundle, [frames[i].gimbal for i in known])
+    bundle = _fitted(bundle, own, more, frames, places, sigmas, start.rotations[:, :, 2], easts, SIGMAS_PX)
     bundle = _without_weak_ties(bundle)
     while len(bundle) and (few := np.bincount(bundle.image, minlength=len(bundle)) < FEWEST_RAYS).any():
         bundle = bundle.without(few)
@@ -132,7 +134,8 @@ def _fitted(
     frames: Sequence[Frame],
     places: Array,
     place_sigmas: Array,
-    turns: Array,
+    ups: Array,
+    easts: Array,
     sigmas_px: Sequence[float],
 ) -> Bundle:
     """Cameras adjusted to the tracks of matches, from where they are."""
@@ -148,8 +151,8 @@ def _fitted(
             pixel_sigma=np.full(len(bundle.image), sigma),
             places=places,
             place_sigmas=place_sigmas,
-            ups=turns[:, :, 2],
-            easts=turns[:, :, 0],
+            ups=ups,
+            easts=easts,
             lens_fixed=np.ones(len(bundle.lenses), bool),
         )
         bundle = adjusted(bundle, held, tolerance=ROUGHLY).bundle

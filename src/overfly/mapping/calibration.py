@@ -16,7 +16,7 @@ from overfly.mapping.bundle import Bundle
 from overfly.mapping.database import focal_px
 from overfly.mapping.features import LONGEST_SIDE
 from overfly.mapping.model import FEWEST_TO_CALIBRATE
-from overfly.mapping.placing import FEW_RAYS, widened
+from overfly.mapping.placing import FEW_RAYS, FEWEST_TO_SCATTER, widened
 from overfly.mapping.ties import unchecked_ties, untied
 
 UNTOLD = "The images do not tell the focal length"
@@ -55,9 +55,8 @@ NO_LENS_SIGMA = 0.0001
 LOOSE = 10.0
 """Factor on the standard deviation of GPS until it has shown what it is worth."""
 
-LEAST_DEG, FEWEST_TO_JUDGE = 0.2, 8
-"""Degrees that gimbals are taken to scatter by at the least, and how many must show that they scatter by less than is
-usual."""
+LEAST_DEG = 0.2
+"""Degrees that gimbals are taken to scatter by at the least."""
 
 NORMAL, RAYLEIGH = 0.6745, 1.1774
 """Median size of a normal value of standard deviation 1, and length of two."""
@@ -101,8 +100,10 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
     kept = result.bundle.kept(result.bundle.errors() <= WORST_PX * _shrunk(bundle, frames))
     kept = kept.kept(~unchecked_ties(kept, np.asarray(np.isfinite(held.places[:, :2]).all(1))))
     images = free(kept, NOISE_PX * _shrunk(kept, frames))
-    tilted = np.linalg.norm(kept.rotations[:, :, 2] - held.ups, axis=1)
-    turned = np.abs((kept.rotations[:, :, 1] * held.easts).sum(1))
+    few = np.bincount(kept.image, minlength=len(kept)) < FEW_RAYS
+    judges = ~few & [frames[i].gimbal is not None for i in kept.frames]
+    tilted = np.linalg.norm(kept.rotations[:, :, 2] - held.ups, axis=1)[judges]
+    turned = np.abs((kept.rotations[:, :, 1] * held.easts).sum(1))[judges]
     again = replace(
         held,
         pixel_sigma=images.pixel_sigma,
@@ -116,8 +117,11 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
 
 
 def gimbal_sigma(off: Array, most: float) -> float:
-    """Standard deviation, radians, of what gimbals are off [n] (NaN: not told), each by its usual share of one."""
-    if np.isfinite(off).sum() < FEWEST_TO_JUDGE:
+    """Standard deviation, radians, by how far gimbals are off [n], in medians of what one of unit deviation is off.
+
+    NaN: not told. Few tell nothing, and ``most`` is taken.
+    """
+    if np.isfinite(off).sum() < FEWEST_TO_SCATTER:
         return most
     return min(most, max(np.deg2rad(LEAST_DEG), float(np.nanmedian(off))))
 

@@ -12,7 +12,7 @@ from overfly.errors import InputError
 from overfly.flights import Frame
 from overfly.flights.georeference import by_gps, level_line, on_a_line
 from overfly.geometry import Array, rotation_from_gimbal
-from overfly.mapping.bundle import Bundle, merged
+from overfly.mapping.bundle import Bundle, components, merged
 from overfly.mapping.ties import placed_by_others
 
 GPS_SIGMA_M = (0.5, 0.5)
@@ -89,7 +89,7 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
         InputError: GPS does not scale the largest part.
     """
     done: list[tuple[Bundle, Array, Array, Array, Array]] = []
-    for number, part in enumerate(parts):
+    for number, part in enumerate(_not_by_chance(parts, frames, warnings)):
         own = [frames[i] for i in part.frames]
         gimbals, places = [frame.gimbal for frame in own], told[part.frames]
         if number and np.isfinite(places[:, :2]).all(1).sum() < FEWEST_OF_A_PART:
@@ -106,13 +106,6 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
                 "say: wrong matches have placed them, or these gimbals are wrong. Look at the picture of the block, "
                 "and fly with more overlap."
             )
-        if (wrong := by_chance(part, gimbals)).any() and (~wrong).sum() >= 2:
-            warnings.append(
-                f"{some_of(wrong, own)} were left out: they share few points with others, and these contradict their "
-                "gimbals. Fly with more overlap there."
-            )
-            part, places = part.without(wrong), places[~wrong]
-            own, gimbals = ([each for each, bad in zip(of, wrong, strict=True) if not bad] for of in (own, gimbals))
         clean = without_faults(part, places, own, warnings)
         if np.isnan(clean).sum() > np.isnan(places).sum() and np.isfinite(clean[:, :2]).all(1).sum() >= 2:
             part = part.moved(by_gps(part.centres, clean, gimbals, part.world_from_camera))
@@ -124,7 +117,7 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
         if np.isnan(places[:, 2]).all():  # the heights stay as they are, so that the equations are regular
             places[:, 2] = np.where(np.isfinite(places[:, 0]), part.centres[:, 2], np.nan)
             sigmas[:, 2] = UNKNOWN_M
-        done.append((part, places, sigmas, ups, _easts(part, gimbals)))
+        done.append((part, places, sigmas, ups, easts_of(part, gimbals)))
     numbers = np.concatenate([part.frames for part, *_ in done])
     order = np.argsort(numbers, kind="stable")
     bundle = merged([part for part, *_ in done])
@@ -132,13 +125,13 @@ def placed(parts: Sequence[Bundle], frames: Sequence[Frame], told: Array, warnin
     return Placed(bundle, places, sigmas, ups, easts, apart=np.sort(numbers[len(done[0][0]) :]))
 
 
-def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame]) -> bool:
+def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame], *, mostly: bool = False) -> bool:
     """Whether a bundle, brought to the flight's GPS positions [n, 3] by a similarity, comes near to most of them.
 
     No image may be far away from its own, or tilted otherwise than its gimbal says: either what is told of it is wrong,
-    or it has been placed by wrong matches.
+    or it has been placed by wrong matches. With ``mostly`` single images may, but not half of them.
     """
-    if tilted(bundle, frames).any():
+    if (wrong := tilted(bundle, frames)).mean() >= 0.5 or (wrong.any() and not mostly):
         return False
     places = told[bundle.frames]
     try:
@@ -148,7 +141,7 @@ def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame]) -> boo
     away = np.linalg.norm((moved.centres - places)[:, :2], axis=1)
     extent = float((np.nanmax(places[:, :2], axis=0) - np.nanmin(places[:, :2], axis=0)).max())
     usual = max(FAR_OFF_M, DISTORTED * extent)
-    return float(np.nanmedian(away)) < usual and float(np.nanmax(away)) < LOST * usual
+    return float(np.nanmedian(away)) < usual and (mostly or float(np.nanmax(away)) < LOST * usual)
 
 
 def tilted(bundle: Bundle, frames: Sequence[Frame]) -> NDArray[np.bool_]:
@@ -164,6 +157,23 @@ def tilted(bundle: Bundle, frames: Sequence[Frame]) -> NDArray[np.bool_]:
     if np.median(angles) < LEVEL_DEG:
         wrong[known] = angles > TILTED_DEG
     return wrong
+
+
+def _not_by_chance(parts: Sequence[Bundle], frames: Sequence[Frame], warnings: list[str]) -> list[Bundle]:
+    """The parts without images that are :func:`by_chance` where they are, and what these held together apart."""
+    kept: list[Bundle] = []
+    for part in parts:
+        own = [frames[i] for i in part.frames]
+        wrong = by_chance(part, [frame.gimbal for frame in own])
+        if not wrong.any() or (~wrong).sum() < 2:
+            kept.append(part)
+            continue
+        warnings.append(
+            f"{some_of(wrong, own)} were left out: they share few points with others, and these contradict their "
+            "gimbals. Fly with more overlap there."
+        )
+        kept += components(part.without(wrong))
+    return sorted(kept, key=len, reverse=True)
 
 
 def by_chance(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> NDArray[np.bool_]:
@@ -182,8 +192,8 @@ def by_chance(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | Non
         directions = off[:, :, column]
         middle = np.median(directions, axis=0)
         angles = np.rad2deg(np.arccos(np.clip(directions @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
-        if column == 0:  # those of a whole line may be told the other way round
-            angles = np.minimum(angles, 180 - angles)
+        if column == 0:  # of whole lines they may be wrong: that says nothing of the image
+            angles = np.where(angles > TURNED_DEG, 0, angles)
         usual = float(np.median(angles))
         wrong[np.array(told)[few & (angles > max(LEAST_OFF_DEG, SCATTERED * usual))]] = True
     return wrong
@@ -247,18 +257,24 @@ def _ups(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None], *
     return ups
 
 
-def _easts(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
-    """East in camera axes [n, 3] by the gimbals, the error that all of them have in common taken out.
+def easts_of(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
+    """East in camera axes [n, 3] by the gimbals, the error that most of them have in common taken out.
 
-    Some tell that of a whole line the other way round. The error in common is the compass's; GPS turns the block.
+    That is the compass's; GPS turns the block. NaN of those that are far off it (some are told the other way round for
+    a whole line), and of all where few have one in common.
     """
     easts = np.full((len(bundle), 3), np.nan)
     turns = {k: rotation_from_gimbal(*gimbal) for k, gimbal in enumerate(gimbals) if gimbal is not None}
     off = {k: (bundle.world_from_camera[k] @ turn.T)[:2, 0] for k, turn in turns.items()}  # where its east lies
     by = {k: float(np.arctan2(north, east)) for k, (east, north) in off.items()}
-    near = {k: angle for k, angle in by.items() if abs(angle) < np.deg2rad(TURNED_DEG)}
-    if near:
-        common = float(np.median(list(near.values())))
+    angles = np.array(list(by.values()))
+    apart = (angles[:, None] - angles + np.pi) % (2 * np.pi) - np.pi
+    close = np.abs(apart) < np.deg2rad(TURNED_DEG) / 2
+    if close.sum(1).max(initial=0) >= FEWEST_GIMBALS:
+        middle = int(close.sum(1).argmax())
+        common = float(angles[middle] + np.median(apart[close[:, middle], middle]))
+        off_common = np.abs((angles - common + np.pi) % (2 * np.pi) - np.pi)
+        near = [k for k, angle in zip(by, off_common, strict=True) if angle < np.deg2rad(TURNED_DEG)]
         turned = np.array([np.cos(common), -np.sin(common), 0.0])
         for k in near:
             easts[k] = turned @ turns[k]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from overfly.errors import InputError
-from overfly.flights import Flight
+from overfly.flights import Flight, Frame
 from overfly.geometry import Array
 from overfly.mapping.agreement import Agreement, agreement, rewritten
 from overfly.mapping.bundle import Bundle, components
@@ -35,7 +35,7 @@ GPS, if they are at least so many times as many."""
 WORSE = 2.0
 """Times by which reprojection errors may be larger where more images are placed."""
 
-FEWEST_RAYS = 50
+FEWEST_BELIEVED = 50
 """Points of its median image from which on a model is believed although it contradicts GPS: less agrees by chance."""
 
 GOOD_PX = 0.5
@@ -160,11 +160,17 @@ def sparse_parts(
         )
     parts = [] if prior is None else components(prior)
     trusted = found is not None and found.believed.mean() >= TRUSTED
-    if parts and not agrees_with_gps(parts[0], told, flight.frames):
+    if parts and not agrees_with_gps(parts[0], told, flight.frames, mostly=True):
         parts = []
-    if not parts or (best.parts and not _better(parts[0], best.parts[0], best.agrees, trusted)):
+    chance = _by_chance(best, told, flight.frames)
+    if not parts and chance:
+        raise InputError(
+            f"The images share too little to be placed: what {len(best.parts[0])} of them have in common ({chance} "
+            "points in the median image) contradicts GPS, and so few agree by chance. Give images that overlap by 60 % "
+            "or more."
+        )
+    if not parts or (best.parts and not chance and not _better(parts[0], best.parts[0], best.agrees, trusted)):
         warnings += remark
-        _refuse_chance(best)
         return best.parts
     left = len(names) - (len(best.parts[0]) if best.parts else 0)
     failed = f"left out {left} of {len(names)} images"
@@ -179,17 +185,12 @@ def sparse_parts(
     return parts
 
 
-def _refuse_chance(best: _Start) -> None:
-    """Raise where a model contradicts GPS and too few points hold its images together."""
-    if not best.parts or best.agrees:
-        return
-    model = best.parts[0]
-    if (usual := int(np.median(np.bincount(model.image, minlength=len(model))))) < FEWEST_RAYS:
-        raise InputError(
-            f"The images share too little to be placed: what {len(model)} of them have in common ({usual} points in "
-            "the median image) contradicts GPS and gimbals, and so few agree by chance. Give images that overlap by "
-            "60 % or more."
-        )
+def _by_chance(best: _Start, told: Array, frames: Sequence[Frame]) -> int:
+    """Points of the median image of a model that contradicts GPS and rests on too few of them; else 0."""
+    if not best.parts or best.agrees or agrees_with_gps(best.parts[0], told, frames, mostly=True):
+        return 0
+    usual = int(np.median(np.bincount(best.parts[0].image, minlength=len(best.parts[0]))))
+    return max(usual, 1) if usual < FEWEST_BELIEVED else 0
 
 
 def _better(new: Bundle, old: Bundle, agrees: bool, trusted: bool) -> bool:
