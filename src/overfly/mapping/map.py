@@ -27,7 +27,7 @@ from overfly.mapping.settings import MapSettings
 from overfly.mapping.steps import Steps, claim, fingerprint, key_of, unwritable
 from overfly.mapping.tiles import Tiles, keep_tiles, kept_tiles
 
-BLOCK_FORM, DENSE_FORM = 29, 31
+BLOCK_FORM, DENSE_FORM = 30, 31
 """Of what the steps keep, half-finished parts included: raised whenever the same images and settings become another
 block, or the same block another cloud, so that a map resumed from an older version's folder mixes nothing."""
 
