@@ -221,39 +221,20 @@ def test_cameras_by_priors_replace_a_model_that_contradicts_gps(
     assert sparse._better(*parts, agrees, trusted) == taken
 
 
-@pytest.mark.parametrize(("rays", "agrees", "refused"), [(49, False, True), (50, False, False), (49, True, False)])
-def test_a_model_of_few_points_that_contradicts_gps_is_refused(
-    rays: int, agrees: bool, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("images", "rays", "agreeing", "taken"),
+    [
+        (5, 49, [], None),
+        (5, 50, [], "held"),
+        (5, 49, ["held"], "held"),
+        (6, 20, ["prior"], "prior"),  # fewer images, but they agree
+    ],
+)
+def test_a_model_of_few_points_that_contradicts_gps_gives_way_or_is_refused(
+    images: int, rays: int, agreeing: list[str], taken: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Cameras by priors contradict GPS, too, so that they do not take its place."""
-    model = Part("held", 5, rays=rays)
-    monkeypatch.setattr(sparse, "mapped", lambda *_, **__: [model])
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_, **__: agrees and part is model)
-    monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
-    monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(6, bool)))
-    monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 6)
-    monkeypatch.setattr(sparse, "upheld", lambda part, _: len(part))
-    monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: Part("prior", 6))
-    monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
-    flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(6)])
-
-    def parts() -> Any:
-        return sparse.sparse_parts(
-            tmp_path / "db", flight, [], np.zeros((6, 3)), tmp_path, 0, lambda *_: nullcontext(lambda *_: None), []
-        )
-
-    if refused:
-        with pytest.raises(InputError, match=r"49 points in the median image\) contradicts GPS"):
-            parts()
-    else:
-        assert parts() == [model]
-
-
-def test_fewer_cameras_by_priors_that_agree_replace_a_model_of_few_points_that_contradicts_gps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sparse, "mapped", lambda *_, **__: [Part("held", 6, rays=20)])
-    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_, **__: part.name == "prior")
+    monkeypatch.setattr(sparse, "mapped", lambda *_, **__: [Part("held", images, rays=rays)])
+    monkeypatch.setattr(sparse, "agrees_with_gps", lambda part, *_, **__: part.name in agreeing)
     monkeypatch.setattr(sparse, "read_points", lambda *_: ([], []))
     monkeypatch.setattr(sparse, "agreement", lambda *_: Agreement({}, [], [], np.zeros(6, bool)))
     monkeypatch.setattr(sparse, "priors", lambda *_: ["prior"] * 6)
@@ -261,7 +242,15 @@ def test_fewer_cameras_by_priors_that_agree_replace_a_model_of_few_points_that_c
     monkeypatch.setattr(sparse, "bundle_by_priors", lambda *_, **__: Part("prior", 5))
     monkeypatch.setattr(sparse, "components", lambda bundle: [bundle])
     flight = Flight(tmp_path, [Frame(f"{i}.jpg", tmp_path / f"{i}.jpg", 400, 300) for i in range(6)])
-    parts: Any = sparse.sparse_parts(
-        tmp_path / "db", flight, [], np.zeros((6, 3)), tmp_path, 0, lambda *_: nullcontext(lambda *_: None), []
-    )
-    assert [part.name for part in parts] == ["prior"]
+
+    def names() -> list[str]:
+        parts: Any = sparse.sparse_parts(
+            tmp_path / "db", flight, [], np.zeros((6, 3)), tmp_path, 0, lambda *_: nullcontext(lambda *_: None), []
+        )
+        return [part.name for part in parts]
+
+    if taken is None:
+        with pytest.raises(InputError, match=r"49 points in the median image\) contradicts GPS"):
+            names()
+    else:
+        assert names() == [taken]

@@ -92,9 +92,9 @@ def adjusted_twice(bundle: Bundle, held: Held, frames: Sequence[Frame]) -> Adjus
     Headings hold only images of few rays, and gimbals that scatter little hold these more than others: errors that
     gimbals have in common would bend a block that its rays hold better.
     """
-    # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
     few = np.bincount(bundle.image, minlength=len(bundle)) < FEW_RAYS
     held = replace(held, heading_sigma=np.where(few, HEADING_SIGMA, np.inf))
+    # Loosely first: GPS that is worse than it says would bend the block and look better than it is.
     loose = replace(held, place_sigmas=held.place_sigmas * LOOSE, lens_sigma=LENS_SIGMA)
     result = adjusted(bundle, loose, tolerance=ROUGHLY)
     kept = result.bundle.kept(result.bundle.errors() <= WORST_PX * _shrunk(bundle, frames))

@@ -35,7 +35,7 @@ TILTED_DEG, LEVEL_DEG, FEWEST_GIMBALS = 20.0, 5.0, 4
 Headings are not asked: Brighton's gimbals tell those of one line the other way round."""
 
 TURNED_DEG = 20.0
-"""A heading that is so far from the block's is wrong, or the image is."""
+"""A heading that is so far from what most are off is wrong, or the image is."""
 
 FEW_RAYS, FEWEST_TO_SCATTER = 150, 8
 """Rays from which on an image is believed against its gimbal, and gimbals that tell what is usual."""
@@ -63,8 +63,8 @@ class Placed:
         sigmas: their standard deviations [n, 3], metres.
         ups: the vertical in camera axes [n, 3]: by the gimbals, which level a small block as well as GPS does; of
             images without one, where GPS does not level the block, as it stands; NaN for the others.
-        easts: east in camera axes [n, 3], by the gimbals against one another; NaN where the block says something
-            else.
+        easts: east in camera axes [n, 3], by the gimbals against one another; NaN where one is far off the
+            others, and of few.
         apart: frames that no common points but GPS alone connects to the largest part.
     """
 
@@ -146,17 +146,19 @@ def agrees_with_gps(bundle: Bundle, told: Array, frames: Sequence[Frame], *, mos
 
 def tilted(bundle: Bundle, frames: Sequence[Frame]) -> NDArray[np.bool_]:
     """Which images of a bundle, in any frame of reference, are tilted otherwise than their gimbals say [k]."""
-    told = _ups(bundle, [frames[i].gimbal for i in bundle.frames.tolist()], level=False)
-    known = np.isfinite(told[:, 0])
-    wrong = np.zeros(len(bundle), bool)
-    if known.sum() < FEWEST_GIMBALS:
-        return wrong
-    ups = np.einsum("nij,nj->ni", bundle.world_from_camera[known], told[known])  # all alike, were there no errors
-    middle = np.median(ups, axis=0)
-    angles = np.rad2deg(np.arccos(np.clip(ups @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
-    if np.median(angles) < LEVEL_DEG:
-        wrong[known] = angles > TILTED_DEG
-    return wrong
+    angles = _tilts(bundle, [frames[i].gimbal for i in bundle.frames.tolist()])
+    known = np.isfinite(angles)
+    if known.sum() < FEWEST_GIMBALS or np.median(angles[known]) >= LEVEL_DEG:
+        return np.zeros(len(bundle), bool)
+    return angles > TILTED_DEG
+
+
+def _tilts(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | None]) -> Array:
+    """Degrees [n] of each gimbal's vertical from where most of them have it; NaN without a gimbal."""
+    ups = np.einsum("nij,nj->ni", bundle.world_from_camera, _ups(bundle, gimbals, level=False))
+    known = np.isfinite(ups[:, 0])  # all alike, were there no errors
+    middle = np.median(ups[known], axis=0) if known.any() else np.zeros(3)
+    return np.rad2deg(np.arccos(np.clip(ups @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
 
 
 def _not_by_chance(parts: Sequence[Bundle], frames: Sequence[Frame], warnings: list[str]) -> list[Bundle]:
@@ -182,18 +184,12 @@ def by_chance(bundle: Bundle, gimbals: Sequence[tuple[float, float, float] | Non
     Some dozen wrong matches agree by chance on a pose that is off by degrees, and outweigh any prior. Headings are not
     asked here either: on half of Brighton they are off by line.
     """
-    told = [k for k, gimbal in enumerate(gimbals) if gimbal is not None]
-    wrong = np.zeros(len(bundle), bool)
-    if len(told) < FEWEST_TO_SCATTER:
-        return wrong
-    turns = np.stack([rotation_from_gimbal(*(gimbals[k] or (0, 0, 0))) for k in told])
-    off = bundle.world_from_camera[told] @ turns.transpose(0, 2, 1)  # all alike, were there no errors
-    few = np.bincount(bundle.image, minlength=len(bundle))[told] < FEW_RAYS
-    ups = off[:, :, 2]
-    middle = np.median(ups, axis=0)
-    angles = np.rad2deg(np.arccos(np.clip(ups @ middle / max(float(np.linalg.norm(middle)), 1e-9), -1, 1)))
-    wrong[np.array(told)[few & (angles > max(LEAST_OFF_DEG, SCATTERED * float(np.median(angles))))]] = True
-    return wrong
+    angles = _tilts(bundle, gimbals)
+    known = np.isfinite(angles)
+    if known.sum() < FEWEST_TO_SCATTER:
+        return np.zeros(len(bundle), bool)
+    few = np.bincount(bundle.image, minlength=len(bundle)) < FEW_RAYS
+    return few & (angles > max(LEAST_OFF_DEG, SCATTERED * float(np.median(angles[known]))))
 
 
 def far_off(distance: Array) -> NDArray[np.bool_]:

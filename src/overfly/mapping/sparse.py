@@ -162,14 +162,17 @@ def sparse_parts(
     trusted = found is not None and found.believed.mean() >= TRUSTED
     if parts and not agrees_with_gps(parts[0], told, flight.frames, mostly=True):
         parts = []
-    chance = _by_chance(best, told, flight.frames)
-    if not parts and chance:
+    few = _too_few(best, told, flight.frames)
+    if few is not None and not parts:
         raise InputError(
-            f"The images share too little to be placed: what {len(best.parts[0])} of them have in common ({chance} "
+            f"The images share too little to be placed: what {len(best.parts[0])} of them have in common ({few} "
             "points in the median image) contradicts GPS, and so few agree by chance. Give images that overlap by 60 % "
             "or more."
         )
-    if not parts or (best.parts and not chance and not _better(parts[0], best.parts[0], best.agrees, trusted)):
+    worse = (
+        few is None and bool(best.parts) and bool(parts) and not _better(parts[0], best.parts[0], best.agrees, trusted)
+    )
+    if not parts or worse:
         warnings += remark
         return best.parts
     left = len(names) - (len(best.parts[0]) if best.parts else 0)
@@ -185,12 +188,12 @@ def sparse_parts(
     return parts
 
 
-def _by_chance(best: _Start, told: Array, frames: Sequence[Frame]) -> int:
-    """Points of the median image of a model that contradicts GPS and rests on too few of them; else 0."""
+def _too_few(best: _Start, told: Array, frames: Sequence[Frame]) -> int | None:
+    """Points of the median image of a model that contradicts GPS and rests on too few of them; None of any other."""
     if not best.parts or best.agrees or agrees_with_gps(best.parts[0], told, frames, mostly=True):
-        return 0
+        return None
     usual = int(np.median(np.bincount(best.parts[0].image, minlength=len(best.parts[0]))))
-    return max(usual, 1) if usual < FEWEST_BELIEVED else 0
+    return usual if usual < FEWEST_BELIEVED else None
 
 
 def _better(new: Bundle, old: Bundle, agrees: bool, trusted: bool) -> bool:
